@@ -1,0 +1,45 @@
+"""The data: trajectories, where they come from, and the batches that training reads.
+
+Importing this package is cheap: nothing heavy is loaded before its name is used, so that the processes which
+collect data never import a deep-learning library.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from datamodules.collect.pointmaze import WaypointController as WaypointController
+    from datamodules.collect.pointmaze import collect_pointmaze as collect_pointmaze
+    from datamodules.inspection import check_dataset as check_dataset
+    from datamodules.inspection import describe as describe
+    from datamodules.segments import SegmentDataModule as SegmentDataModule
+    from datamodules.segments import TensorLoader as TensorLoader
+    from datamodules.sources import load_trajectories as load_trajectories
+    from datamodules.trajectories import Trajectories as Trajectories
+    from datamodules.validation import DataError as DataError
+
+_HOMES = {
+    "DataError": "datamodules.validation",
+    "RelabeledDataModule": "datamodules.relabel",
+    "SegmentDataModule": "datamodules.segments",
+    "TensorLoader": "datamodules.segments",
+    "Trajectories": "datamodules.trajectories",
+    "WaypointController": "datamodules.collect.pointmaze",
+    "check_dataset": "datamodules.inspection",
+    "collect_pointmaze": "datamodules.collect.pointmaze",
+    "describe": "datamodules.inspection",
+    "load_trajectories": "datamodules.sources",
+    "relabel": "datamodules.relabel",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'datamodules' has no attribute '{name}'")
+    return getattr(importlib.import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOMES})

@@ -1,0 +1,136 @@
+"""The behaviour that makes PointMaze data: waypoints from the planner, a velocity controller, and noise on purpose.
+
+Coverage decides what can be learnt. A controller that always drives well never shows the learner a wall, a dead end
+or a body at rest, and a value network that has not seen them believes that goals are near as the crow flies.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from datamodules.collect.planner import planner_for
+from dds_lightning.errors import UserError
+from dds_lightning.tasks import Task
+
+
+@dataclass(frozen=True)
+class BehaviourNoise:
+    """How far the behaviour strays; the defaults are those of `collect_pointmaze`.
+
+    Attributes:
+        waypoint_offset: Waypoints lie up to this far from a cell's centre, in cells, on both axes.
+        action_noise: Standard deviation of the Gaussian noise on every action entry.
+        burst_probability: Chance that a step outside a burst starts one.
+        burst_steps: Shortest and longest burst.
+        start_offset: Episodes start up to this far from a cell's centre, in cells, at rest.
+    """
+
+    waypoint_offset: float = 0.35
+    action_noise: float = 0.2
+    burst_probability: float = 0.008
+    burst_steps: tuple[int, int] = (10, 50)
+    start_offset: float = 0.38
+
+    def __post_init__(self) -> None:
+        """Refuse what makes no sense."""
+        for name in ("waypoint_offset", "start_offset"):
+            value = getattr(self, name)
+            if not 0.0 <= value <= 0.4:
+                raise UserError(f"{name}: found {value}, expected 0 to 0.4 cells; beyond that lies the wall")
+        if not 0.0 <= self.action_noise < math.inf:
+            raise UserError(f"action_noise: found {self.action_noise}, expected a number of at least 0")
+        if not 0.0 <= self.burst_probability <= 1.0:
+            raise UserError(f"burst_probability: found {self.burst_probability}, expected 0 to 1")
+        low, high = self.burst_steps
+        if not 1 <= low <= high:
+            raise UserError(f"burst_steps: found {self.burst_steps}, expected 1 <= shortest <= longest")
+
+
+QUIET = BehaviourNoise(waypoint_offset=0.0, action_noise=0.0, burst_probability=0.0, start_offset=0.0)
+"""No noise at all: the controller at its best."""
+
+
+class Driver:
+    """Drives one point mass towards one goal at a time.
+
+    Everything random is drawn once an episode, before the first step; a step is then a few Python floats, which is
+    cheaper than NumPy on two numbers and makes an episode a function of its seed alone.
+    """
+
+    def __init__(self, task: Task, *, speed: float = 4.5, gain: float = 0.5) -> None:
+        """Prepare for `task`.
+
+        Args:
+            task: A maze task whose actions are forces on x and y.
+            speed: Cruising speed in metres a second; the environment stops at 5 on each axis.
+            gain: Action for one metre a second of velocity error.
+        """
+        maze = task._maze()
+        self.planner = planner_for(maze)
+        self.rows, self.columns, self.size = len(maze), len(maze[0]), task.cell_size
+        self.speed, self.gain = speed, gain
+        cells = np.array([divmod(i, self.columns) for i in range(self.rows * self.columns)])
+        self._centres: list[list[float]] = task.cell_to_xy(cells).tolist()
+        self._next: list[list[int]] = self.planner.next_cell.tolist()
+        self.start_episode(np.random.default_rng(0), 1, QUIET)
+
+    def start_episode(self, rng: np.random.Generator, steps: int, noise: BehaviourNoise) -> None:
+        """Draw an episode's noise: action noise, bursts, waypoint offsets."""
+        self._noise = (noise.action_noise * rng.standard_normal((steps, 2))).tolist()
+        self._burst = _bursts(rng, steps, noise)
+        self._offsets = (
+            rng.uniform(-noise.waypoint_offset, noise.waypoint_offset, (steps, 2)) * self.size
+        ).tolist()
+        self._step, self._cell, self._goal = 0, -1, -1
+        self._target = [0.0, 0.0]
+
+    def _index(self, x: float, y: float) -> int:
+        row = math.floor(self.rows / 2 - y / self.size)
+        column = math.floor(x / self.size + self.columns / 2)
+        return min(max(row, 0), self.rows - 1) * self.columns + min(max(column, 0), self.columns - 1)
+
+    def act(self, x: float, y: float, vx: float, vy: float, goal: tuple[float, float]) -> tuple[float, float]:
+        """The force for this step, in the box."""
+        step = self._step
+        self._step = step + 1
+        burst = self._burst[step]
+        if burst is not None:
+            return burst
+        cell, aim = self._index(x, y), self._index(*goal)
+        if cell != self._cell or aim != self._goal:
+            self._cell, self._goal = cell, aim
+            centre, offset = self._centres[self._next[aim][cell]], self._offsets[step]
+            self._target = [centre[0] + offset[0], centre[1] + offset[1]]
+        target_x, target_y = goal if cell == aim else self._target
+        dx, dy = target_x - x, target_y - y
+        scale = self.speed / (math.hypot(dx, dy) + 1e-6)
+        noise = self._noise[step]
+        force_x = self.gain * (dx * scale - vx) + noise[0]
+        force_y = self.gain * (dy * scale - vy) + noise[1]
+        return min(max(force_x, -1.0), 1.0), min(max(force_y, -1.0), 1.0)
+
+
+def _bursts(
+    rng: np.random.Generator, steps: int, noise: BehaviourNoise
+) -> list[tuple[float, float] | None]:
+    """Steps of an episode at which a random action replaces the controller's, and that action.
+
+    Half of the bursts hold one force (they press the body against walls), half draw a new one at every step.
+    """
+    plan: list[tuple[float, float] | None] = [None] * steps
+    if noise.burst_probability <= 0:
+        return plan
+    low, high = noise.burst_steps
+    step = int(rng.geometric(noise.burst_probability)) - 1
+    while step < steps:
+        length = int(rng.integers(low, high + 1))
+        forces = rng.uniform(-1.0, 1.0, (length, 2))
+        if rng.random() < 0.5:
+            forces[:] = forces[0]
+        for k, (fx, fy) in enumerate(forces.tolist()[: steps - step]):
+            plan[step + k] = (fx, fy)
+        step += length + int(rng.geometric(noise.burst_probability)) - 1
+    return plan

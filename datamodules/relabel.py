@@ -1,0 +1,260 @@
+"""Stage two: relabel the data with skills, one semi-MDP transition a segment (section 4.2).
+
+```
+ s_t  a_t r_t   a_t+1 r_t+1  ...  a_t+H-1 r_t+H-1   s_t+H
+ └ state                                            └ next state        k = argmin_j ||E(tau) - z_j||
+       └────── reward: sum of gamma^(i-1) r_i ─────┘                    discount: gamma, or gamma^h
+```
+
+A segment that reaches a *termination* after h < H steps is kept: its reward is discounted to the end, ``done`` cuts
+the bootstrap, and the encoder averages over the h steps alone. A segment that a *time-out* cuts short is dropped: the
+skill was not carried through, and nothing ended.
+"""
+
+import hashlib
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+import torch
+from rich.progress import track
+from safetensors import safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from datamodules.trajectories import Trajectories
+from dds_lightning.errors import UserError
+from dds_lightning.skill import SkillModule
+
+Discount = Literal["per_skill", "per_step"]
+FORMAT = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Relabelled:
+    """M semi-MDP transitions."""
+
+    observations: Tensor
+    """(M, O)."""
+    codes: Tensor
+    """(M,) int64."""
+    rewards: Tensor
+    """(M,) sum of discounted rewards inside the segment, in the task's learning convention."""
+    next_observations: Tensor
+    """(M, O) state after the segment's last step."""
+    discounts: Tensor
+    """(M,) factor on the bootstrap."""
+    dones: Tensor
+    """(M,) float, 1 where the segment ends in a termination."""
+    starts: Tensor
+    """(M,) int64 step of the data set at which the segment begins."""
+    num_skills: int
+    """K."""
+
+    def __len__(self) -> int:
+        """Number of transitions M."""
+        return len(self.codes)
+
+    def batch(self, index: Tensor) -> dict[str, Tensor]:
+        """The transitions at ``index`` (B,) as the policy's batch."""
+        return {
+            "observations": self.observations[index],
+            "codes": self.codes[index],
+            "rewards": self.rewards[index],
+            "next_observations": self.next_observations[index],
+            "discounts": self.discounts[index],
+            "dones": self.dones[index],
+        }
+
+    def summary(self) -> pd.DataFrame:
+        """One row a code: share of the data, mean reward, mean displacement of the first two observations.
+
+        ``dx`` and ``dy`` are the mean change of the first two dimensions (the position in a maze) over a segment, in
+        the environment's units, ``distance`` the mean length of that change.
+        """
+        moved = (self.next_observations - self.observations)[:, :2].cpu().numpy()  # (M, 2)
+        frame = pd.DataFrame(
+            {
+                "code": self.codes.cpu().numpy(),
+                "reward": self.rewards.cpu().numpy(),
+                "dx": moved[:, 0],
+                "dy": moved[:, -1],
+                "distance": np.linalg.norm(moved, axis=1),
+                "done": self.dones.cpu().numpy(),
+            }
+        )
+        groups = frame.groupby("code")
+        table = groups[["reward", "dx", "dy", "distance"]].mean()
+        table.insert(0, "segments", groups.size())
+        table.insert(1, "share", groups.size() / len(frame))
+        table["terminations"] = groups["done"].sum().astype(int)
+        table = table.reindex(range(self.num_skills))
+        counts = ["segments", "share", "terminations"]
+        table[counts] = table[counts].fillna(0)
+        return table.astype({"segments": int, "terminations": int}).rename_axis("code").reset_index()
+
+    def save(self, path: str | Path, key: dict[str, str | int | float]) -> None:
+        """Write the transitions and what they were made from, atomically, as one safetensors file."""
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        metadata = {"format": str(FORMAT), "num_skills": str(self.num_skills), "key": json.dumps(key, sort_keys=True)}
+        names = ("observations", "codes", "rewards", "next_observations", "discounts", "dones", "starts")
+        try:
+            save_file({name: getattr(self, name).contiguous().cpu() for name in names}, temporary, metadata=metadata)
+            with temporary.open("rb") as file:
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+    @classmethod
+    def load(cls, path: str | Path, key: dict[str, str | int | float] | None = None) -> "Relabelled":
+        """Read a relabelled file.
+
+        Args:
+            path: the file.
+            key: what it must have been made from; not checked without it.
+
+        Raises:
+            UserError: no such file, not a relabelled file, or made from something else (what, is named).
+        """
+        try:
+            with safe_open(path, framework="pt") as file:
+                metadata = file.metadata() or {}
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
+        except FileNotFoundError:
+            raise UserError(f"there is no relabelled file {path}: make it with `dds relabel`") from None
+        except Exception as error:
+            raise UserError(f"{path} is no readable relabelled file ({error}): delete it and relabel") from error
+        if metadata.get("format") != str(FORMAT):
+            raise UserError(
+                f"{path} has relabelling format {metadata.get('format')!r}, this version reads {FORMAT}: relabel"
+            )
+        found = json.loads(metadata["key"])
+        if key is not None and found != json.loads(json.dumps(key)):
+            wrong = [f"{name} {found.get(name)!r} instead of {value!r}" for name, value in key.items() if found.get(name) != value]
+            raise UserError(
+                f"{path} was relabelled with other inputs ({'; '.join(wrong)}): choose another file or relabel"
+            )
+        return cls(**tensors, num_skills=int(metadata["num_skills"]))
+
+
+def relabel_key(
+    trajectories: Trajectories,
+    skill: SkillModule,
+    *,
+    gamma: float,
+    discount: Discount,
+    stride: int,
+    reward_scale: float,
+    reward_shift: float,
+) -> dict[str, str | int | float]:
+    """Everything a relabelled set depends on: data, skill weights, H, gamma, discount, stride, reward convention."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(skill.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return {
+        "data": trajectories.fingerprint(),
+        "skill": digest.hexdigest(),
+        "horizon": skill.horizon,
+        "gamma": gamma,
+        "discount": discount,
+        "stride": stride,
+        "reward_scale": reward_scale,
+        "reward_shift": reward_shift,
+    }
+
+
+@torch.inference_mode()
+def relabel(
+    trajectories: Trajectories,
+    skill: SkillModule,
+    *,
+    gamma: float = 0.99,
+    discount: Discount = "per_skill",
+    stride: int = 1,
+    reward_scale: float = 1.0,
+    reward_shift: float = 0.0,
+    batch_size: int = 2048,
+    progress: bool = False,
+) -> Relabelled:
+    """Turn every segment into a semi-MDP transition (section 4.2).
+
+    Args:
+        trajectories: the data.
+        skill: a discrete skill model of the same observation and action widths.
+        gamma: discount a step inside the segment, in (0, 1].
+        discount: ``per_skill`` bootstraps with gamma (the paper's formula), ``per_step`` with gamma^h.
+        stride: steps between the starts of two segments.
+        reward_scale: learning reward = reward_scale * (reward + reward_shift).
+        reward_shift: see ``reward_scale``.
+        batch_size: segments encoded at once.
+        progress: show a bar.
+
+    Raises:
+        UserError: widths that differ between data and model, no segment of H steps, gamma out of range.
+    """
+    if not 0.0 < gamma <= 1.0:
+        raise UserError(f"gamma is {gamma}, expected a discount in (0, 1]")
+    check_widths(trajectories, skill)
+    horizon = skill.horizon
+    windows = trajectories.windows(horizon, stride, tail="terminated")
+    starts, observation_starts, lengths = windows.starts, windows.observation_starts, windows.lengths
+    steps = np.minimum(np.arange(horizon), lengths[:, None] - 1)  # (M, H): a short segment repeats its last step
+    device = skill.device
+
+    codes = []
+    batches = range(0, len(starts), batch_size)
+    was_training = skill.training
+    skill.eval()
+    for first in track(batches, "relabelling", disable=not progress, transient=True):
+        rows = slice(first, first + batch_size)
+        observations = trajectories.observations[observation_starts[rows, None] + steps[rows]]  # (B, H, O)
+        actions = trajectories.actions[starts[rows, None] + steps[rows]]  # (B, H, A)
+        short = lengths[rows] < horizon
+        codes.append(
+            skill.encode(
+                torch.as_tensor(observations, device=device),
+                torch.as_tensor(actions, device=device),
+                torch.as_tensor(lengths[rows], device=device) if short.any() else None,
+            ).cpu()
+        )
+    skill.train(was_training)
+
+    learning = reward_scale * (trajectories.rewards.astype(np.float64) + reward_shift)  # (N,)
+    rewards = np.zeros(len(starts))
+    for i in range(horizon):
+        taken = i < lengths
+        rewards[taken] += gamma**i * learning[starts[taken] + i]
+    factor = np.full(len(starts), gamma) if discount == "per_skill" else gamma**lengths
+    ends = starts + lengths - 1  # (M,) last step of each segment
+    return Relabelled(
+        observations=torch.as_tensor(trajectories.observations[observation_starts]),
+        codes=torch.cat(codes),
+        rewards=torch.as_tensor(rewards, dtype=torch.float32),
+        next_observations=torch.as_tensor(trajectories.observations[observation_starts + lengths]),
+        discounts=torch.as_tensor(factor, dtype=torch.float32),
+        dones=torch.as_tensor(trajectories.terminations[ends].astype(np.float32)),
+        starts=torch.as_tensor(starts),
+        num_skills=skill.num_skills,
+    )
+
+
+def check_widths(trajectories: Trajectories, skill: SkillModule) -> None:
+    """Refuse a skill model whose observation or action width is not the data's."""
+    for name, found in (
+        ("observation_dim", trajectories.observation_dim),
+        ("action_dim", trajectories.actions.shape[1]),
+    ):
+        expected = skill.hparams[name]
+        if found != expected:
+            raise UserError(
+                f"the skill checkpoint has {name} {expected}, data set {trajectories.name!r} has {found}: "
+                "use a checkpoint trained on this task's data"
+            )

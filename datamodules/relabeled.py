@@ -1,0 +1,175 @@
+"""The semi-MDP transitions as a data module: relabel once, keep the result on disk, serve batches from memory."""
+
+import logging
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as pl
+import torch
+from torch import Tensor
+
+from datamodules.relabel import Discount, Relabelled, relabel, relabel_key
+from datamodules.segments import TensorLoader
+from datamodules.sources import load_trajectories
+from datamodules.trajectories import Trajectories
+from dds_lightning.errors import UserError
+from dds_lightning.skill import SkillModule
+from dds_lightning.tasks import Task, get_task
+
+log = logging.getLogger(__name__)
+
+
+class RelabeledDataModule(pl.LightningDataModule):
+    """Semi-MDP transitions of a data set under the skills of a checkpoint.
+
+    Relabelling runs once: its result lies under ``cache`` in a file named after the hash of data, skill weights, H,
+    gamma, discount, stride and reward convention, so that nothing stale is ever read.
+
+    Args:
+        task: name of a task (``dds tasks``); null for your own data.
+        data: where the data are, e.g. ``local:DIR`` or ``minari:ID``.
+        skill: skill checkpoint: a Lightning ``.ckpt`` or a published directory.
+        relabelled: read this file (of ``dds relabel``) instead of the cache; refused if made from anything else.
+        cache: folder of the cache; null puts it beside the skill checkpoint.
+        gamma: discount a step.
+        discount: ``per_skill`` bootstraps with gamma (the paper), ``per_step`` with gamma^h.
+        stride: steps between the starts of two segments.
+        reward_scale: overrides the task's factor on the learning reward.
+        reward_shift: overrides the task's shift of the learning reward.
+        batch_size: transitions a batch.
+        validation_fraction: share of the episodes held out.
+        seed: of the split and of the order.
+        device_resident: keep the transitions on the accelerator.
+    """
+
+    def __init__(
+        self,
+        task: str | None = None,
+        data: str | None = None,
+        skill: str | None = None,
+        relabelled: str | None = None,
+        cache: str | None = None,
+        gamma: float = 0.99,
+        discount: Discount = "per_skill",
+        stride: int = 1,
+        reward_scale: float | None = None,
+        reward_shift: float | None = None,
+        batch_size: int = 256,
+        validation_fraction: float = 0.05,
+        seed: int = 0,
+        device_resident: bool = False,
+    ) -> None:
+        super().__init__()
+        self.save_hyperparameters()
+        self.task: Task | None = get_task(task) if task else None
+        if skill is None:
+            raise UserError("data.skill is missing: give the skill checkpoint (.ckpt or directory) to relabel with")
+        if not 0.0 <= validation_fraction < 1.0:
+            raise UserError(f"data.validation_fraction is {validation_fraction}, expected a share in [0, 1)")
+        self.skill = SkillModule.load(skill)
+        self.observation_dim: int = self.skill.hparams.observation_dim
+        self.num_skills: int = self.skill.num_skills
+        self.transitions: Relabelled | None = None
+        self._given: Trajectories | None = None
+
+    @classmethod
+    def from_trajectories(cls, trajectories: Trajectories, skill: str, **settings: Any) -> "RelabeledDataModule":
+        """Build the module over trajectories already in memory."""
+        module = cls(skill=skill, **settings)
+        module._given = trajectories
+        return module
+
+    @cached_property
+    def trajectories(self) -> Trajectories:
+        """The data set, loaded at first use."""
+        if self._given is not None:
+            return self._given
+        if self.hparams.data is None:
+            raise UserError(
+                "data.data is missing: give local:DIR or minari:ID, or collect with `dds data collect TASK`"
+            )
+        return load_trajectories(self.hparams.data, self.task)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What relabelling depends on beside data and skills."""
+        h = self.hparams
+        scale = self.task.reward_scale if self.task else 1.0
+        shift = self.task.reward_shift if self.task else 0.0
+        return {
+            "gamma": h.gamma,
+            "discount": h.discount,
+            "stride": h.stride,
+            "reward_scale": scale if h.reward_scale is None else h.reward_scale,
+            "reward_shift": shift if h.reward_shift is None else h.reward_shift,
+        }
+
+    def cache_file(self) -> Path:
+        """Where the relabelled data of exactly these inputs lie."""
+        import hashlib
+        import json
+
+        key = relabel_key(self.trajectories, self.skill, **self.settings)
+        name = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:16]
+        skill = Path(self.hparams.skill)
+        folder = Path(self.hparams.cache) if self.hparams.cache else (skill if skill.is_dir() else skill.parent)
+        return folder / f"relabelled-{name}.safetensors"
+
+    def prepare_data(self) -> None:
+        """Relabel, unless the result of exactly these inputs is on disk."""
+        if self.hparams.relabelled is None and not self.cache_file().exists():
+            made = relabel(self.trajectories, self.skill, **self.settings, progress=True)
+            made.save(self.cache_file(), relabel_key(self.trajectories, self.skill, **self.settings))
+            log.info("relabelled %d segments into %s", len(made), self.cache_file())
+
+    def setup(self, stage: str | None = None) -> None:
+        """Read the transitions and split them by episode."""
+        if self.transitions is not None:
+            return
+        key = relabel_key(self.trajectories, self.skill, **self.settings)
+        path = Path(self.hparams.relabelled) if self.hparams.relabelled else self.cache_file()
+        self.transitions = Relabelled.load(path, key)
+        train, validation = self.trajectories.split(self.hparams.validation_fraction, self.hparams.seed)
+        episode = torch.as_tensor(self.trajectories.episode_of(self.transitions.starts.numpy()))
+        self.train_index = torch.nonzero(torch.isin(episode, torch.as_tensor(train))).flatten()
+        self.validation_index = torch.nonzero(torch.isin(episode, torch.as_tensor(validation))).flatten()
+
+    def statistics(self) -> dict[str, Any]:
+        """What the policy keeps of the data: normalisation, code shares, range of rewards, greatest discount."""
+        assert self.transitions is not None, "setup() comes first"
+        t, i = self.transitions, self.train_index
+        observations, rewards = t.observations[i], t.rewards[i]
+        counts = torch.bincount(t.codes[i], minlength=self.num_skills).float()
+        return {
+            "observation_mean": observations.mean(dim=0),
+            "observation_std": observations.std(dim=0),
+            "code_share": counts / counts.sum(),
+            "reward_range": (rewards.min().item(), rewards.max().item()),
+            "max_discount": t.discounts[i].max().item(),
+        }
+
+    def _loader(self, index: Tensor, shuffle: bool) -> TensorLoader:
+        assert self.transitions is not None, "setup() comes first"
+        transitions = self.transitions
+
+        def gather(rows: Tensor) -> dict[str, Tensor]:
+            return transitions.batch(index[rows])
+
+        h = self.hparams
+        return TensorLoader(gather, len(index), h.batch_size, shuffle=shuffle, seed=h.seed)
+
+    def train_dataloader(self) -> TensorLoader:
+        """Shuffled batches; the order is a function of seed and epoch."""
+        return self._loader(self.train_index, shuffle=True)
+
+    def val_dataloader(self) -> TensorLoader:
+        """The held-out episodes' transitions, in order."""
+        return self._loader(self.validation_index, shuffle=False)
+
+    test_dataloader = val_dataloader
+
+    def predict_dataloader(self) -> TensorLoader:
+        """Every transition, in order."""
+        assert self.transitions is not None, "setup() comes first"
+        return self._loader(torch.arange(len(self.transitions)), shuffle=False)

@@ -1,0 +1,343 @@
+"""Batches of segments for skill training: every tensor in memory, every batch one fancy index."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import lightning.pytorch as L
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from datamodules.sources import load_trajectories
+from datamodules.trajectories import DataError, Trajectories, Windows
+from dds_lightning.errors import UserError
+from dds_lightning.tasks import get_task
+
+Batch = dict[str, Tensor]
+
+STD_FLOOR = 1e-3
+"""Standard deviations are at least this, so that an observation that never changes does not divide by zero."""
+
+
+class TensorLoader:
+    """Batches by index, in an order that is a function of (seed, epoch).
+
+    A new iteration is a new epoch, whether or not the last one was finished. After `load_state_dict` the next
+    iteration goes on after the last batch that was handed out, or starts the next epoch if that was the last one.
+    Lightning saves and restores this state by itself. There are no workers: indexing is cheaper than a message.
+    """
+
+    def __init__(
+        self,
+        gather: Callable[[Tensor], Batch],
+        size: int,
+        batch_size: int,
+        shuffle: bool = False,
+        seed: int = 0,
+        *,
+        drop_last: bool = False,
+        rank: int = 0,
+        world_size: int = 1,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        """Prepare to iterate.
+
+        Args:
+            gather: (B,) int64 indices on `device` -> a batch.
+            size: Number of items; indices run from 0 to size - 1.
+            batch_size: B; no larger than `size`.
+            shuffle: Permute at every epoch; else the order is 0, 1, 2, ...
+            seed: Of the permutations.
+            drop_last: Leave out a last batch that is not full.
+            rank: Number of this process; it takes every `world_size`-th item.
+            world_size: Number of processes.
+            device: Where the indices go.
+        """
+        if size < world_size:
+            raise UserError(f"data: found {size} items for {world_size} processes, expected at least one each")
+        if batch_size < 1:
+            raise UserError(f"batch_size: found {batch_size}, expected at least 1")
+        self.gather, self.size, self.shuffle, self.seed = gather, size, shuffle, seed
+        self.rank, self.world_size, self.device = rank, world_size, torch.device(device)
+        self._share = size // world_size
+        self.batch_size = min(batch_size, self._share)
+        self.drop_last = drop_last
+        self._epoch, self._batch, self._resuming = -1, 0, False
+
+    def __len__(self) -> int:
+        """Batches of an epoch."""
+        full, rest = divmod(self._share, self.batch_size)
+        return full + (0 if self.drop_last or not rest else 1)
+
+    def order(self, epoch: int) -> Tensor:
+        """(size,) the items in the order of `epoch`, before they are divided among processes."""
+        if not self.shuffle:
+            return torch.arange(self.size)
+        entropy = np.random.SeedSequence([self.seed, epoch]).generate_state(1, np.uint64)[0]
+        generator = torch.Generator().manual_seed(int(entropy >> np.uint64(1)))
+        return torch.randperm(self.size, generator=generator)
+
+    def __iter__(self) -> Iterator[Batch]:
+        """Batches of the next epoch, or the rest of the one that was restored."""
+        # All of this runs at the first `next`, and nothing after the last `yield` matters: Lightning makes iterators
+        # that it never starts, and does not exhaust those that it does.
+        if not (self._resuming and 0 <= self._epoch and self._batch < len(self)):
+            self._epoch, self._batch = self._epoch + 1, 0
+        self._resuming = False
+        order = self.order(self._epoch)[self.rank :: self.world_size][: self._share].to(self.device)
+        while self._batch < len(self):
+            start = self._batch * self.batch_size
+            self._batch += 1
+            yield self.gather(order[start : start + self.batch_size])
+
+    def state_dict(self) -> dict[str, int]:
+        """Epoch, batches handed out, and what the order depends on."""
+        return {"epoch": self._epoch, "batch": self._batch, **self._identity()}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        """Go on where `state` was taken.
+
+        Raises:
+            UserError: When the loader would hand out other batches than the one whose state this is.
+        """
+        for key, own in self._identity().items():
+            if state.get(key) != own:
+                raise UserError(
+                    f"data: the checkpoint was made with {key} = {state.get(key)}, now it is {own}; resume with the "
+                    "same data and batch size"
+                )
+        self._epoch, self._batch, self._resuming = state["epoch"], state["batch"], True
+
+    def _identity(self) -> dict[str, int]:
+        return {
+            "size": self.size, "batch_size": self.batch_size, "seed": self.seed, "shuffle": int(self.shuffle)
+        }  # fmt: skip
+
+
+def split_episodes(
+    trajectories: Trajectories, fraction: float, seed: int, horizon: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Episodes for training and for validation, none in both.
+
+    Episodes are drawn at random until they hold `fraction` of all steps. Those shorter than `horizon` stay with
+    training, where they are left out anyway.
+
+    Returns:
+        Sorted episode numbers for training and for validation.
+
+    Raises:
+        DataError: When a part would be empty.
+    """
+    if not 0.0 <= fraction < 1.0:
+        raise UserError(f"validation_fraction: found {fraction}, expected at least 0 and less than 1")
+    everything = np.arange(trajectories.num_episodes)
+    if fraction == 0:
+        return everything, everything[:0]
+    usable = everything[trajectories.lengths >= horizon]
+    if len(usable) == 1:
+        raise DataError(
+            f"data set '{trajectories.name}': only one episode has {horizon} steps, so none can be put aside for "
+            "validation; use more data, or validation_fraction 0"
+        )
+    shuffled = np.random.default_rng([seed, 1]).permutation(usable)
+    before = np.cumsum(trajectories.lengths[shuffled]) - trajectories.lengths[shuffled]
+    count = int(np.sum(before < fraction * trajectories.num_steps))
+    validation = np.sort(shuffled[: min(max(count, 1), len(usable) - 1)])
+    return np.setdiff1d(everything, validation), validation
+
+
+class SegmentDataModule(L.LightningDataModule):
+    """Sliding windows over offline episodes, as batches `{"observations": (B, H, O), "actions": (B, H, A)}`.
+
+    Units are raw; the model normalises with `statistics()`. Windows never cross an episode. Training and validation
+    have no episode in common.
+
+    From your own arrays: `SegmentDataModule.from_trajectories(Trajectories.from_episodes("mine", episodes))`; the
+    form of `episodes` is in the docstring of `datamodules.trajectories`.
+
+    Attributes:
+        trajectories: All data, after `setup`.
+        horizon: H.
+    """
+
+    trajectories: Trajectories
+
+    def __init__(
+        self,
+        task: str | None = None,
+        data: str | None = None,
+        horizon: int = 10,
+        stride: int = 1,
+        batch_size: int = 128,
+        validation_fraction: float = 0.05,
+        seed: int = 0,
+        device_resident: bool = False,
+        max_validation_segments: int = 4096,
+    ) -> None:
+        """Say which data; nothing is read yet.
+
+        Args:
+            task: Name of a task (`dds tasks` lists them). The data must fit it. None takes any sound data.
+            data: `local:DIR`, `minari:ID` or `arrays:DIR`, see `datamodules.load_trajectories`.
+            horizon: H, steps of a segment.
+            stride: Steps between segments: 1 takes every window, H divides episodes into separate segments.
+            batch_size: B.
+            validation_fraction: Share of the steps, in whole episodes, that is kept for validation.
+            seed: Of the split and of the order of batches.
+            device_resident: Keep the data on the training device; batches are then made there.
+            max_validation_segments: At most this many segments, evenly spread, are validated.
+        """
+        super().__init__()
+        for name, value in (("horizon", horizon), ("stride", stride), ("batch_size", batch_size)):
+            if value < 1:
+                raise UserError(f"{name}: found {value}, expected at least 1")
+        if max_validation_segments < 1:
+            raise UserError(f"max_validation_segments: found {max_validation_segments}, expected at least 1")
+        if not 0.0 <= validation_fraction < 1.0:
+            raise UserError(f"validation_fraction: found {validation_fraction}, expected 0 to less than 1")
+        self.task = get_task(task) if task is not None else None
+        self.data, self.horizon, self.stride, self.batch_size = data, horizon, stride, batch_size
+        self.validation_fraction, self.seed = validation_fraction, seed
+        self.device_resident, self.max_validation_segments = device_resident, max_validation_segments
+        self._windows: Windows | None = None
+        self._on_device: dict[torch.device, tuple[Tensor, Tensor]] = {}
+
+    @classmethod
+    def from_trajectories(cls, trajectories: Trajectories, **options: Any) -> SegmentDataModule:
+        """The same over data that are in memory already; `options` are those of the constructor."""
+        module = cls(**options)
+        module.trajectories = trajectories
+        return module
+
+    # ------------------------------------------------------------------ what the model must know
+
+    @property
+    def observation_dim(self) -> int:
+        """O, from the task's row, else from the data."""
+        return self.task.observation_dim if self.task is not None else self._loaded().observation_dim
+
+    @property
+    def action_dim(self) -> int:
+        """A, from the task's row, else from the data."""
+        return self.task.action_dim if self.task is not None else self._loaded().action_dim
+
+    def statistics(self) -> dict[str, Tensor]:
+        """Statistics of the training episodes, float32.
+
+        Returns:
+            `observation_mean` and `observation_std` (O,), the latter at least `STD_FLOOR`; `action_low` and
+            `action_high` (A,).
+        """
+        self.setup()
+        data = self.trajectories
+        chosen = np.zeros(data.num_episodes, bool)
+        chosen[self.training_episodes] = True
+        rows = np.flatnonzero(np.repeat(chosen, data.lengths + 1))
+        total = np.zeros(data.observation_dim)
+        for part in _parts(rows):
+            total += data.observations[part].sum(axis=0, dtype=np.float64)
+        mean = total / len(rows)
+        squares = np.zeros_like(mean)
+        for part in _parts(rows):
+            squares += np.square(data.observations[part] - mean).sum(axis=0)
+        std = np.maximum(np.sqrt(squares / len(rows)), STD_FLOOR)
+        return {
+            "observation_mean": torch.from_numpy(mean.astype(np.float32)),
+            "observation_std": torch.from_numpy(std.astype(np.float32)),
+            "action_low": torch.tensor(data.action_low),
+            "action_high": torch.tensor(data.action_high),
+        }
+
+    # ------------------------------------------------------------------ Lightning's hooks
+
+    def setup(self, stage: str | None = None) -> None:
+        """Read the data, find the windows, split by episode; does nothing the second time."""
+        if self._windows is not None:
+            return
+        data = self._loaded()
+        self._windows = data.windows(self.horizon, self.stride)
+        self.training_episodes, self.validation_episodes = split_episodes(
+            data, self.validation_fraction, self.seed, self.horizon
+        )
+        held_out = np.isin(self._windows.episodes, self.validation_episodes)
+        self.training_segments = np.flatnonzero(~held_out)
+        kept = np.flatnonzero(held_out)
+        count = min(len(kept), self.max_validation_segments)
+        self.validation_segments = kept[np.linspace(0, len(kept) - 1, count).round().astype(np.int64)]
+
+    def train_dataloader(self) -> TensorLoader:
+        """Shuffled, full batches, shared among processes."""
+        self.setup()
+        trainer = self.trainer
+        rank, world = (trainer.global_rank, trainer.world_size) if trainer is not None else (0, 1)
+        return self._loader(
+            self.training_segments, shuffle=True, seed=self.seed, drop_last=True, rank=rank, world_size=world
+        )
+
+    def val_dataloader(self) -> TensorLoader | list[Any]:
+        """The same segments in the same order every time; none when `validation_fraction` is 0."""
+        self.setup()
+        return self._loader(self.validation_segments) if len(self.validation_segments) else []
+
+    def test_dataloader(self) -> TensorLoader | list[Any]:
+        """As for validation."""
+        return self.val_dataloader()
+
+    def predict_dataloader(self) -> TensorLoader:
+        """Every segment, in order."""
+        self.setup()
+        assert self._windows is not None
+        return self._loader(np.arange(len(self._windows)))
+
+    # ------------------------------------------------------------------ inside
+
+    def _loaded(self) -> Trajectories:
+        if not hasattr(self, "trajectories"):
+            if self.data is None:
+                raise UserError(self._how_to_get_data())
+            self.trajectories = load_trajectories(self.data, self.task)
+        return self.trajectories
+
+    def _how_to_get_data(self) -> str:
+        if self.task is None:
+            return "data: neither a task nor data were given; pass for example data='local:DIR' or a task with its data"
+        collected = f"`dds data collect {self.task.name} --out data`"
+        place = f"local:data/{self.task.data_ids.get('minari', self.task.name)}"
+        return f"data: none was given for task '{self.task.name}'; collect some with {collected} and pass {place}"
+
+    def _loader(self, segments: NDArray[np.int64], **options: Any) -> TensorLoader:
+        assert self._windows is not None
+        device = torch.device("cpu")
+        if self.device_resident and self.trainer is not None:
+            device = self.trainer.strategy.root_device
+        observations, actions = self._tensors(device)
+        first_rows = torch.from_numpy(self._windows.observation_starts[segments]).to(device)
+        first_steps = torch.from_numpy(self._windows.starts[segments]).to(device)
+        span = torch.arange(self.horizon, device=device)
+
+        def gather(index: Tensor) -> Batch:
+            return {
+                "observations": observations[first_rows[index, None] + span],  # (B, H, O)
+                "actions": actions[first_steps[index, None] + span],  # (B, H, A)
+            }
+
+        return TensorLoader(gather, len(segments), self.batch_size, device=device, **options)
+
+    def _tensors(self, device: torch.device) -> tuple[Tensor, Tensor]:
+        if device not in self._on_device:
+            with warnings.catch_warnings():
+                # Memory maps are read-only; batches are copies, so nothing writes through these tensors.
+                warnings.filterwarnings("ignore", message=".*not writable.*")
+                observations = torch.from_numpy(self.trajectories.observations).to(device)
+                actions = torch.from_numpy(self.trajectories.actions).to(device)
+            self._on_device[device] = (observations, actions)
+        return self._on_device[device]
+
+
+def _parts(rows: NDArray[np.int64], size: int = 1 << 20) -> Iterator[NDArray[np.int64]]:
+    for start in range(0, len(rows), size):
+        yield rows[start : start + size]

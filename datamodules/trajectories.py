@@ -1,0 +1,312 @@
+"""The one container of offline data: flat arrays for episodes of different length.
+
+    episode 0 (T = 3)                 episode 1 (T = 2)
+    o0  o1  o2  o3                    o4  o5  o6              observations, N + E rows
+      a0  a1  a2                        a3  a4                actions, rewards, flags: N rows
+                └ terminations or         └
+                  truncations True
+
+Step `s` of episode `e` acts on observation row `s + e` and leads to row `s + e + 1`.
+
+Your own arrays come in by `Trajectories.from_episodes`:
+
+    episodes = [
+        {
+            "observations": ...,   # (T + 1, O), the state after the last step included
+            "actions": ...,        # (T, A), inside the box
+            "rewards": ...,        # (T,)
+            "terminations": ...,   # (T,) True on the last step if the task ended there (no bootstrap beyond)
+            "truncations": ...,    # (T,) True on the last step if only the recording ended there
+        },
+    ]
+    data = SegmentDataModule.from_trajectories(Trajectories.from_episodes("mine", episodes), horizon=10)
+"""
+
+from __future__ import annotations
+
+import hashlib
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from datamodules.validation import DataError, validate_episode
+
+__all__ = ["DataError", "Trajectories", "Windows"]
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Segments of up to H steps, each inside one episode.
+
+    Attributes:
+        starts: (M,) int64, first step.
+        observation_starts: (M,) int64, row of the first observation.
+        lengths: (M,) int64, steps h: H, or fewer where a termination cuts the segment short.
+        episodes: (M,) int64.
+    """
+
+    starts: NDArray[np.int64]
+    observation_starts: NDArray[np.int64]
+    lengths: NDArray[np.int64]
+    episodes: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        """Number of segments M."""
+        return len(self.starts)
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectories:
+    """Episodes in flat arrays (in memory or memory-mapped); see the module's picture.
+
+    Make one with `from_episodes`, `load` or `datamodules.load_trajectories`: those check what they are given.
+
+    Attributes:
+        name: Of the data set.
+        observations: (N + E, O) float32; episode e has lengths[e] + 1 rows.
+        actions: (N, A) float32.
+        rewards: (N,) float32, in the environment's unit (the task's scale and shift come later).
+        terminations: (N,) bool, True where the task ended: there is nothing to bootstrap from.
+        truncations: (N,) bool, True where only the recording ended.
+        lengths: (E,) int64, steps of each episode.
+        action_low: (A,) float32.
+        action_high: (A,) float32.
+    """
+
+    name: str
+    observations: NDArray[np.float32]
+    actions: NDArray[np.float32]
+    rewards: NDArray[np.float32]
+    terminations: NDArray[np.bool_]
+    truncations: NDArray[np.bool_]
+    lengths: NDArray[np.int64]
+    action_low: NDArray[np.float32]
+    action_high: NDArray[np.float32]
+
+    # ------------------------------------------------------------------ making one
+
+    @classmethod
+    def from_episodes(
+        cls,
+        name: str,
+        episodes: Sequence[Mapping[str, Any]],
+        *,
+        action_low: ArrayLike = -1.0,
+        action_high: ArrayLike = 1.0,
+        observation_dim: int | None = None,
+        action_dim: int | None = None,
+        episode_names: Sequence[str] | None = None,
+    ) -> Trajectories:
+        """Check episodes and lay them end to end.
+
+        Args:
+            name: Of the data set, for messages.
+            episodes: Mappings of the five fields in the module's docstring; other entries are ignored.
+            action_low: Lower bound of actions, one number or (A,).
+            action_high: Upper bound of actions.
+            observation_dim: O; None takes the first episode's.
+            action_dim: A; None takes the first episode's.
+            episode_names: What messages call the episodes; None counts from "episode 0".
+
+        Raises:
+            DataError: When there is no episode, or one is not as it must be; the message names the data set, the
+                episode, the field and the value.
+        """
+        if not len(episodes):
+            raise DataError(f"data set '{name}' is empty: it has no episodes")
+        first = episodes[0]
+        observation_dim = observation_dim or _width(first.get("observations"))
+        action_dim = action_dim or _width(first.get("actions")) or 1
+        low = np.broadcast_to(np.asarray(action_low, np.float32), (action_dim,)).copy()
+        high = np.broadcast_to(np.asarray(action_high, np.float32), (action_dim,)).copy()
+        names = episode_names or [f"episode {e}" for e in range(len(episodes))]
+        checked = [
+            validate_episode(
+                name, label, fields, observation_dim=observation_dim, action_low=low, action_high=high
+            )
+            for label, fields in zip(names, episodes, strict=True)
+        ]
+        joined = {key: np.concatenate([fields[key] for fields in checked]) for key in checked[0]}
+        lengths = np.array([len(fields["rewards"]) for fields in checked], np.int64)
+        return cls(name=name, lengths=lengths, action_low=low, action_high=high, **joined)
+
+    def select(self, episode_ids: ArrayLike) -> Trajectories:
+        """A new container with these episodes, in this order (a copy)."""
+        ids = np.asarray(episode_ids, np.int64)
+        if not ids.size:
+            raise DataError(f"data set '{self.name}': no episodes were selected")
+        if ids.min() < 0 or ids.max() >= self.num_episodes:
+            raise DataError(
+                f"data set '{self.name}': episode {ids.min() if ids.min() < 0 else ids.max()} was asked for, "
+                f"expected 0 to {self.num_episodes - 1}"
+            )
+        steps = _ranges(self.step_offsets[ids], self.lengths[ids])
+        rows = _ranges(self.observation_offsets[ids], self.lengths[ids] + 1)
+        return replace(
+            self,
+            observations=self.observations[rows],
+            actions=self.actions[steps],
+            rewards=self.rewards[steps],
+            terminations=self.terminations[steps],
+            truncations=self.truncations[steps],
+            lengths=self.lengths[ids],
+        )
+
+    # ------------------------------------------------------------------ what is in it
+
+    @property
+    def num_steps(self) -> int:
+        """N."""
+        return len(self.rewards)
+
+    @property
+    def num_episodes(self) -> int:
+        """E."""
+        return len(self.lengths)
+
+    @property
+    def observation_dim(self) -> int:
+        """O."""
+        return int(self.observations.shape[1])
+
+    @property
+    def action_dim(self) -> int:
+        """A."""
+        return int(self.actions.shape[1])
+
+    @cached_property
+    def step_offsets(self) -> NDArray[np.int64]:
+        """(E + 1,) first step of each episode, and N."""
+        return np.concatenate([[0], np.cumsum(self.lengths)])
+
+    @cached_property
+    def observation_offsets(self) -> NDArray[np.int64]:
+        """(E + 1,) first observation row of each episode, and N + E."""
+        return self.step_offsets + np.arange(self.num_episodes + 1)
+
+    @cached_property
+    def returns(self) -> NDArray[np.float64]:
+        """(E,) undiscounted return of each episode."""
+        return np.add.reduceat(self.rewards.astype(np.float64), self.step_offsets[:-1])
+
+    def episode(self, number: int) -> dict[str, NDArray[Any]]:
+        """Views of one episode's five arrays."""
+        if not 0 <= number < self.num_episodes:
+            raise DataError(
+                f"data set '{self.name}': there is no episode {number}, expected 0 to {self.num_episodes - 1}"
+            )
+        steps = slice(self.step_offsets[number], self.step_offsets[number + 1])
+        rows = slice(self.observation_offsets[number], self.observation_offsets[number + 1])
+        return {
+            "observations": self.observations[rows],
+            "actions": self.actions[steps],
+            "rewards": self.rewards[steps],
+            "terminations": self.terminations[steps],
+            "truncations": self.truncations[steps],
+        }
+
+    @cached_property
+    def _fingerprint(self) -> str:
+        digest = hashlib.sha256()
+        for key, array in self.arrays().items():
+            digest.update(f"{key} {array.dtype.str} {array.shape}\n".encode())
+            digest.update(np.ascontiguousarray(array).view(np.uint8).reshape(-1).data)
+        return digest.hexdigest()
+
+    def fingerprint(self) -> str:
+        """SHA-256 of all arrays (not of the name), computed once."""
+        return self._fingerprint
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Every array by name."""
+        return {key: value for key, value in vars(self).items() if isinstance(value, np.ndarray) and key in _ARRAYS}
+
+    # ------------------------------------------------------------------ segments
+
+    def windows(self, horizon: int, stride: int = 1, tail: Literal["full", "terminated"] = "full") -> Windows:
+        """Sliding windows that never cross an episode.
+
+        Args:
+            horizon: H, steps of a window.
+            stride: Steps between the starts of two windows of one episode; H divides episodes into separate parts.
+            tail: "full" takes windows of H steps only. "terminated" also takes the shorter ones that end in a
+                termination: they tell the learner where episodes end. Windows cut by a time-out are never taken,
+                because nothing is known of the steps that they lack.
+
+        Raises:
+            DataError: When no episode is long enough.
+            ValueError: For a horizon, stride or tail out of range.
+        """
+        if horizon < 1 or stride < 1:
+            raise DataError(f"horizon and stride: found {horizon} and {stride}, expected at least 1")
+        if tail not in ("full", "terminated"):
+            raise DataError(f"tail: found '{tail}', expected 'full' or 'terminated'")
+        ended = self.terminations[self.step_offsets[1:] - 1]
+        # Windows may start at 0, stride, 2 * stride, ... up to (not including) this step of the episode.
+        stop = np.maximum(self.lengths - horizon + 1, 0)
+        if tail == "terminated":
+            stop = np.where(ended, self.lengths, stop)
+        counts = -(-stop // stride)
+        self._warn_of_short(horizon, counts == 0)
+        episodes = np.repeat(np.arange(self.num_episodes), counts)
+        local = _ranges(np.zeros_like(counts), counts) * stride
+        starts = self.step_offsets[episodes] + local
+        return Windows(
+            starts=starts,
+            observation_starts=starts + episodes,
+            lengths=np.minimum(horizon, self.lengths[episodes] - local),
+            episodes=episodes,
+        )
+
+    def _warn_of_short(self, horizon: int, dropped: NDArray[np.bool_]) -> None:
+        if not dropped.any():
+            return
+        if dropped.all():
+            raise DataError(
+                f"data set '{self.name}': horizon {horizon} is longer than every one of the {self.num_episodes} "
+                f"episodes (the longest has {self.lengths.max()} steps); choose a smaller horizon"
+            )
+        warnings.warn(
+            f"data set '{self.name}': {int(dropped.sum())} of {self.num_episodes} episodes are shorter than horizon "
+            f"{horizon} and are left out ({int(self.lengths[dropped].sum())} of {self.num_steps} steps)",
+            stacklevel=3,
+        )
+
+    # ------------------------------------------------------------------ on disk
+
+    def save(self, directory: str | Path, *, overwrite: bool = False) -> Path:
+        """Write one .npy file an array and `trajectories.json`; whole or not at all. See `datamodules.storage`."""
+        from datamodules.storage import save_trajectories
+
+        return save_trajectories(self, directory, overwrite=overwrite)
+
+    @classmethod
+    def load(cls, directory: str | Path, *, mmap: bool = False, verify: bool = True) -> Trajectories:
+        """Read what `save` wrote. See `datamodules.storage.read_trajectories`."""
+        from datamodules.storage import read_trajectories
+
+        return read_trajectories(directory, mmap=mmap, verify=verify)
+
+
+_ARRAYS = (
+    "observations", "actions", "rewards", "terminations", "truncations", "lengths", "action_low", "action_high"
+)  # fmt: skip
+
+
+def _width(value: Any) -> int | None:
+    shape = np.shape(value) if value is not None else ()
+    return int(shape[1]) if len(shape) == 2 else None
+
+
+def _ranges(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """`starts[0] .. starts[0] + counts[0] - 1`, then the next, end to end."""
+    ends = np.cumsum(counts)
+    if not len(ends):
+        return np.zeros(0, np.int64)
+    return np.arange(ends[-1]) + np.repeat(starts - (ends - counts), counts)

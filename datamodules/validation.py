@@ -1,0 +1,139 @@
+"""What a data set must be. Every refusal names the data set, the episode, the field and the value.
+
+File formats accept almost anything (not-a-number, one observation too few, episodes without an end), and a learner
+trained on such data fails late and silently. So everything that enters a `Trajectories` passes through here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dds_lightning.errors import UserError
+
+FIELDS = ("observations", "actions", "rewards", "terminations", "truncations")
+BOX_TOLERANCE = 1e-5
+"""Actions may leave the box by this much (rounding); they are clipped into it."""
+
+
+class DataError(UserError):
+    """A data set that cannot be used as it is."""
+
+
+def validate_episode(
+    dataset: str,
+    episode: str,
+    fields: Mapping[str, Any],
+    *,
+    observation_dim: int | None,
+    action_low: NDArray[np.float32],
+    action_high: NDArray[np.float32],
+) -> dict[str, NDArray[Any]]:
+    """Check one episode and bring it to the types of `Trajectories`.
+
+    Args:
+        dataset: Name of the data set, for messages.
+        episode: Name of the episode, for messages.
+        fields: `FIELDS` to arrays; observations (T + 1, O), actions (T, A), the rest (T,).
+        observation_dim: O; None takes the episode's own.
+        action_low: (A,) lower bounds of the action box.
+        action_high: (A,) upper bounds.
+
+    Returns:
+        The five arrays: float32 for numbers, bool for flags, actions clipped into the box.
+
+    Raises:
+        DataError: At the first thing wrong.
+    """
+    where = f"data set '{dataset}', {episode}"
+    for name in FIELDS:
+        if name not in fields or fields[name] is None:
+            found = ", ".join(fields) or "nothing"
+            raise DataError(f"{where}: '{name}' is missing; expected {', '.join(FIELDS)}, found {found}")
+    arrays = {name: _array(where, name, fields[name]) for name in FIELDS}
+    _check_shapes(where, arrays, observation_dim, len(action_low))
+    for name in ("observations", "actions", "rewards"):
+        arrays[name] = _finite(where, name, arrays[name])
+    arrays["actions"] = _in_box(where, arrays["actions"], action_low, action_high)
+    _check_ends(where, arrays)
+    return arrays
+
+
+def _array(where: str, name: str, value: Any) -> NDArray[Any]:
+    try:
+        array = np.asarray(value)
+    except ValueError:
+        array = np.asarray(None)
+    flag = name in ("terminations", "truncations")
+    if array.dtype.kind not in ("b" if flag else "fiu") and not (flag and array.dtype.kind in "iu"):
+        expected = "true and false" if flag else "real numbers"
+        raise DataError(f"{where}, {name}: found values of type {array.dtype}, expected {expected}")
+    if flag and array.dtype.kind != "b":
+        odd = array[(array != 0) & (array != 1)]
+        if odd.size:
+            raise DataError(f"{where}, {name}: found {odd.flat[0]}, expected 0 or 1")
+        return array.astype(bool)
+    return array
+
+
+def _check_shapes(where: str, arrays: dict[str, NDArray[Any]], observations: int | None, actions: int) -> None:
+    steps = len(arrays["rewards"]) if arrays["rewards"].ndim else 0
+    for name, width in (("observations", observations), ("actions", actions)):
+        shape = arrays[name].shape
+        if len(shape) != 2 or shape[1] != (shape[1] if width is None else width):
+            expected = "(steps, any)" if width is None else f"(steps, {width})"
+            raise DataError(f"{where}, {name}: found shape {shape}, expected {expected}")
+    for name in ("rewards", "terminations", "truncations"):
+        if arrays[name].ndim != 1:
+            raise DataError(f"{where}, {name}: found shape {arrays[name].shape}, expected (steps,)")
+    if steps == 0:
+        raise DataError(f"{where}, rewards: found 0 steps, expected at least 1")
+    for name in ("actions", "terminations", "truncations"):
+        if len(arrays[name]) != steps:
+            raise DataError(f"{where}, {name}: found {len(arrays[name])} rows, but rewards has {steps}")
+    seen = len(arrays["observations"])
+    if seen != steps + 1:
+        missing = "; the observation after the last step is missing" if seen == steps else ""
+        raise DataError(f"{where}, observations: found {seen} rows, expected {steps + 1} (T + 1){missing}")
+
+
+def _finite(where: str, name: str, array: NDArray[Any]) -> NDArray[np.float32]:
+    with np.errstate(over="ignore"):
+        single = array.astype(np.float32)
+    bad = np.argwhere(~np.isfinite(single))
+    if len(bad):
+        index = tuple(int(i) for i in bad[0])
+        value = array[index]
+        place = f"step {index[0]}" + (f", column {index[1]}" if len(index) > 1 else "")
+        raise DataError(f"{where}, {name}: found {value} at {place}, expected finite 32-bit numbers")
+    return single
+
+
+def _in_box(
+    where: str, actions: NDArray[np.float32], low: NDArray[np.float32], high: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    outside = np.argwhere((actions < low - BOX_TOLERANCE) | (actions > high + BOX_TOLERANCE))
+    if len(outside):
+        t, j = (int(i) for i in outside[0])
+        raise DataError(
+            f"{where}, actions: found {actions[t, j]:g} at step {t}, column {j}, expected {low[j]:g} to {high[j]:g}"
+        )
+    return np.clip(actions, low, high)
+
+
+def _check_ends(where: str, arrays: dict[str, NDArray[Any]]) -> None:
+    for name in ("terminations", "truncations"):
+        early = np.flatnonzero(arrays[name][:-1])
+        if len(early):
+            raise DataError(
+                f"{where}, {name}: found True at step {early[0]}, inside an episode of {len(arrays[name])} steps; "
+                "expected it on the last step only"
+            )
+    if not (arrays["terminations"][-1] or arrays["truncations"][-1]):
+        raise DataError(
+            f"{where}: never ends: terminations and truncations are both False on the last step; "
+            "expected one of them True"
+        )

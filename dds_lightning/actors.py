@@ -1,0 +1,112 @@
+"""Whoever acts in environments, and how several agents share one decoder batch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from dds_lightning.agent import DDSAgent
+
+
+class Actor(Protocol):
+    """An agent, a controller, a baseline.
+
+    An actor that has skills also has `codes`, (E,) int64 code in use, and `decided`, (E,) bool whether the last
+    act chose it anew.
+    """
+
+    def reset(self, num_envs: int, seed: int | None = None) -> None:
+        """Forget everything and get ready for `num_envs` environments."""
+
+    def act(
+        self, observations: NDArray[np.float32], restarted: NDArray[np.bool_], rows: NDArray[np.intp]
+    ) -> NDArray[np.float32]:
+        """Act in the environments `rows`; the others have played their last episode.
+
+        Args:
+            observations: (n, O), one for each of `rows`.
+            restarted: (n,), which of them have just begun an episode.
+            rows: (n,), indices among `num_envs`, ascending.
+
+        Returns:
+            (n, A) in the environment's units.
+        """
+        ...
+
+
+class RandomActor:
+    """Uniform actions in the box; the least that any other actor must beat.
+
+    Args:
+        action_dim: A.
+        low: lower bound of every action entry.
+        high: upper bound of every action entry.
+    """
+
+    def __init__(self, action_dim: int, low: float = -1.0, high: float = 1.0) -> None:
+        """Keep the box."""
+        self.action_dim, self.low, self.high = action_dim, low, high
+        self._random = np.random.default_rng(0)
+
+    def reset(self, num_envs: int, seed: int | None = None) -> None:
+        """Start the random stream anew."""
+        self._random = np.random.default_rng(seed)
+
+    def act(
+        self, observations: NDArray[np.float32], restarted: NDArray[np.bool_], rows: NDArray[np.intp]
+    ) -> NDArray[np.float32]:
+        """As `Actor.act`."""
+        return self._random.uniform(self.low, self.high, (len(rows), self.action_dim)).astype(np.float32)
+
+
+class AgentGroup:
+    """Agents on one skill model as one actor: each chooses its own codes, one decoder batch acts for all.
+
+    Rows are the agents' environments, one agent after the other. A small decoder batch costs almost as much as a
+    large one, so this is what makes a table of many contestants cheap.
+
+    Args:
+        agents: with equal `group_key`, no agent twice.
+    """
+
+    def __init__(self, agents: Sequence[DDSAgent]) -> None:
+        """Keep the agents."""
+        assert len({agent.group_key for agent in agents}) == 1, "agents of a group share model and noise"
+        self.agents = list(agents)
+        self._starts = np.zeros(len(agents) + 1, dtype=np.intp)
+
+    def reset(self, sizes: Sequence[int], seeds: Sequence[int]) -> None:
+        """Reset agent i for `sizes[i]` environments with `seeds[i]`; the first's stream is the decoder's."""
+        for agent, size, seed in zip(self.agents, sizes, seeds, strict=True):
+            agent.reset(size, seed)
+        self._starts = np.concatenate([[0], np.cumsum(sizes)])
+
+    @property
+    def codes(self) -> NDArray[np.int64]:
+        """(E,) code in use, one agent after the other."""
+        return np.concatenate([agent.codes for agent in self.agents])
+
+    @property
+    def decided(self) -> NDArray[np.bool_]:
+        """(E,) whether the last act chose a new skill there."""
+        return np.concatenate([agent.decided for agent in self.agents])
+
+    @torch.inference_mode()
+    def act(
+        self, observations: NDArray[np.float32], restarted: NDArray[np.bool_], rows: NDArray[np.intp]
+    ) -> NDArray[np.float32]:
+        """As `Actor.act`, rows counted over all agents."""
+        lead = self.agents[0]
+        x = torch.from_numpy(np.ascontiguousarray(observations)).to(lead.device)  # (n, O)
+        cuts = np.searchsorted(rows, self._starts)
+        parts = [slice(cuts[i], cuts[i + 1]) for i in range(len(self.agents))]
+        codes = [
+            agent.choose(x[part], restarted[part], rows[part] - start)
+            for agent, part, start in zip(self.agents, parts, self._starts, strict=False)
+        ]
+        return lead.decode(x, np.concatenate(codes))

@@ -1,0 +1,319 @@
+"""The agent: a skill every H steps, an action every step (section 4.4, algorithm 2).
+
+```
+ observations (E, O) ─► policy ─► codes (E,)   at each environment's own reset, then every H of its steps
+             └────────► decoder(z_code, s) ─► actions (E, A)                                    every step
+```
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Self, get_args
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor, nn
+
+from dds_lightning.actors import Actor as Actor
+from dds_lightning.actors import AgentGroup
+from dds_lightning.errors import UserError
+
+if TYPE_CHECKING:
+    from dds_lightning.policy import PolicyModule
+    from dds_lightning.skill import SkillModule
+
+AgentSelection = Literal["sample", "greedy", "argmax_q", "random", "fixed"]
+
+
+class DDSAgent(nn.Module):
+    """A skill model and a policy that act together.
+
+    ```python
+    agent = DDSAgent.load("checkpoints/pointmaze-large")
+    agent.reset(num_envs=1, seed=0)
+    action = agent.act(observation)  # in the environment's units, inside its box
+    ```
+
+    The agent draws from a random stream of its own: the same seed gives the same actions, and the global
+    streams stay untouched. Networks are put in evaluation mode and used where they are; nothing is copied.
+
+    Args:
+        skill: decoder and codebook.
+        policy: chooses codes; None for an agent whose `selection` is `random` or `fixed`.
+        selection: `sample` from the policy, `greedy` its likeliest code, `argmax_q` the critic's best
+            supported code, `random` any code with equal chance, `fixed` the codes of `fixed_codes`.
+        temperature: divides the policy's logits before sampling.
+        noise_scale: factor on the decoder's noise; None takes the skill model's own setting.
+        fixed_codes: with `fixed`, environment e plays code `fixed_codes[e % len(fixed_codes)]`.
+        seed: of the random stream until `reset` is given one.
+
+    Raises:
+        UserError: the parts do not fit each other, or a setting is outside its range.
+    """
+
+    def __init__(
+        self,
+        skill: SkillModule,
+        policy: PolicyModule | None = None,
+        selection: AgentSelection = "sample",
+        temperature: float = 1.0,
+        noise_scale: float | None = None,
+        fixed_codes: ArrayLike | None = None,
+        seed: int = 0,
+    ) -> None:
+        """Put the parts together."""
+        super().__init__()
+        self.skill, self.policy = skill, policy
+        self.selection, self.temperature, self.noise_scale = selection, float(temperature), noise_scale
+        self.horizon, self.num_skills = int(skill.horizon), int(skill.num_skills)
+        self.observation_dim = int(skill.hparams["observation_dim"])
+        self.action_dim = int(skill.hparams["action_dim"])
+        self.fixed_codes = None if fixed_codes is None else np.asarray(fixed_codes, dtype=np.int64)
+        self._check()
+        self.eval()
+        self._seed = int(seed)
+        self._generator: torch.Generator | None = None
+        self._codes = np.zeros(0, dtype=np.int64)  # (E,) code in use
+        self._clock = np.zeros(0, dtype=np.int64)  # (E,) steps until the next choice
+        self._decided = np.zeros(0, dtype=bool)  # (E,) whether the last act chose anew
+
+    def _check(self) -> None:
+        choices, codes, last = get_args(AgentSelection), self.fixed_codes, self.num_skills - 1
+        if self.selection not in choices:
+            raise UserError(f"selection is '{self.selection}', expected one of {', '.join(choices)}")
+        if self.temperature <= 0:
+            raise UserError(
+                f"temperature is {self.temperature}, expected more than 0 ('greedy' is the limit)"
+            )
+        if self.noise_scale is not None and self.noise_scale < 0:
+            raise UserError(f"noise_scale is {self.noise_scale}, expected 0 or more")
+        if self.policy is None and self.selection not in ("random", "fixed"):
+            raise UserError(f"selection '{self.selection}' needs a policy; use 'random' or 'fixed' without")
+        if (self.selection == "fixed") != (codes is not None):
+            raise UserError(f"selection is '{self.selection}' and fixed_codes is {codes}: give both or none")
+        if codes is not None and (codes.ndim != 1 or not len(codes) or codes.min() < 0 or codes.max() > last):
+            raise UserError(f"fixed_codes is {codes}, expected a list of codes of 0 to {last}")
+        if self.policy is not None:
+            for name in ("num_skills", "observation_dim"):
+                mine, other = self.skill.hparams[name], self.policy.hparams[name]
+                if mine != other:
+                    raise UserError(f"{name} is {mine} in the skill model and {other} in the policy: no pair")
+
+    # ---------------------------------------------------------------- acting
+
+    def variant(self, selection: AgentSelection | None = None, **settings: Any) -> DDSAgent:
+        """An agent with other settings on the same networks, with clocks and random stream of its own.
+
+        Args:
+            selection: as in the constructor; this agent's without it.
+            **settings: `temperature`, `noise_scale`, `fixed_codes`, `seed`, as in the constructor.
+        """
+        own = {"selection": selection or self.selection, "temperature": self.temperature}
+        own |= {"noise_scale": self.noise_scale, "seed": self._seed}
+        if own["selection"] == "fixed":
+            own["fixed_codes"] = self.fixed_codes
+        return DDSAgent(self.skill, self.policy, **{**own, **settings})
+
+    @property
+    def num_envs(self) -> int:
+        """Environments since the last reset."""
+        return len(self._codes)
+
+    @property
+    def codes(self) -> NDArray[np.int64]:
+        """(E,) code in use in each environment; 0 before the first act."""
+        return self._codes.copy()
+
+    @property
+    def decided(self) -> NDArray[np.bool_]:
+        """(E,) whether the last act chose a new skill there."""
+        return self._decided.copy()
+
+    @property
+    def device(self) -> torch.device:
+        """Where the networks are."""
+        return next(self.skill.parameters()).device
+
+    def reset(self, num_envs: int = 1, seed: int | None = None) -> None:
+        """Start all clocks anew.
+
+        Args:
+            num_envs: E.
+            seed: of the random stream; without one the stream goes on where it was, as in gymnasium.
+        """
+        if num_envs < 1:
+            raise UserError(f"num_envs is {num_envs}, expected at least 1")
+        if seed is not None:
+            self._seed, self._generator = int(seed), None
+        self._codes = np.zeros(num_envs, dtype=np.int64)
+        self._clock = np.zeros(num_envs, dtype=np.int64)
+        self._decided = np.zeros(num_envs, dtype=bool)
+
+    @torch.inference_mode()
+    def act(
+        self,
+        observations: ArrayLike,
+        restarted: NDArray[np.bool_] | None = None,
+        rows: NDArray[np.intp] | None = None,
+    ) -> NDArray[np.float32]:
+        """Act once in every environment.
+
+        Args:
+            observations: (E, O), or (O,) for a single environment.
+            restarted: (E,) environments whose episode has just begun: their skill clock starts anew. Not
+                needed right after `reset`.
+            rows: the environments that `observations` belong to, ascending, when some are left out.
+
+        Returns:
+            (E, A) float32, or (A,) for a single environment; the environment's units, inside its box.
+
+        Raises:
+            UserError: shapes that do not fit.
+        """
+        batch = np.asarray(observations, dtype=np.float32)
+        single, batch = batch.ndim == 1, np.atleast_2d(batch)
+        if not self.num_envs:
+            self.reset(len(batch) if rows is None else int(np.max(rows)) + 1)
+        rows = np.arange(self.num_envs) if rows is None else np.asarray(rows)
+        if batch.ndim != 2 or batch.shape[1] != self.observation_dim:
+            raise UserError(
+                f"observations are {batch.shape}, expected ({len(rows)}, {self.observation_dim}): this agent "
+                "was trained on another environment, or the observations are not flat"
+            )
+        if len(batch) != len(rows):
+            raise UserError(
+                f"{len(batch)} observations for {len(rows)} environments: reset({len(batch)}) first"
+            )
+        if restarted is not None and np.shape(restarted) != rows.shape:
+            raise UserError(f"restarted is {np.shape(restarted)}, expected ({len(rows)},)")
+        x = torch.from_numpy(np.ascontiguousarray(batch)).to(self.device)
+        actions = self.decode(x, self.choose(x, restarted, rows))
+        return actions[0] if single else actions
+
+    def choose(
+        self, observations: Tensor, restarted: NDArray[np.bool_] | None, rows: NDArray[np.intp]
+    ) -> NDArray[np.int64]:
+        """Advance the clocks of `rows`, with a new choice where one has run out: (n, O) to codes (n,)."""
+        if restarted is not None:
+            self._clock[rows[restarted]] = 0
+        due = self._clock[rows] == 0  # (n,)
+        self._decided[:] = False
+        if due.any():
+            late = rows[due]
+            chosen = (
+                observations if due.all() else observations[torch.from_numpy(due).to(observations.device)]
+            )
+            self._codes[late], self._clock[late], self._decided[late] = (
+                self._pick(chosen, late),
+                self.horizon,
+                True,
+            )
+        self._clock[rows] -= 1
+        return self._codes[rows]
+
+    def _pick(self, observations: Tensor, rows: NDArray[np.intp]) -> NDArray[np.int64]:
+        """Codes (m,) for the m environments whose skill has run out."""
+        if self.selection == "fixed":
+            assert self.fixed_codes is not None
+            return self.fixed_codes[rows % len(self.fixed_codes)]
+        stream = self.generator()
+        if self.selection == "random":
+            codes = torch.randint(self.num_skills, (len(rows),), generator=stream, device=stream.device)
+        else:
+            assert self.policy is not None
+            self.policy.eval() if self.policy.training else None
+            codes = self.policy.codes(
+                observations, selection=self.selection, temperature=self.temperature, generator=stream
+            )
+        return codes.cpu().numpy()
+
+    def decode(self, observations: Tensor, codes: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Actions (n, A) of codes (n,) in observations (n, O)."""
+        self.skill.eval() if self.skill.training else None
+        index = torch.from_numpy(codes).to(observations.device)
+        actions = self.skill.decode(
+            observations, index, noise_scale=self.noise_scale, generator=self.generator()
+        )
+        return actions.float().cpu().numpy()
+
+    def generator(self) -> torch.Generator:
+        """The agent's random stream, on the networks' device."""
+        if self._generator is None or self._generator.device.type != self.device.type:
+            self._generator = torch.Generator(self.device).manual_seed(self._seed)
+        return self._generator
+
+    @property
+    def group_key(self) -> tuple[int, float | None]:
+        """Agents with equal keys can act in one decoder batch, see `group`."""
+        return id(self.skill), self.noise_scale
+
+    @staticmethod
+    def group(agents: Sequence[DDSAgent]) -> AgentGroup:
+        """Agents with equal `group_key`s as one actor."""
+        return AgentGroup(agents)
+
+    # ---------------------------------------------------------------- files
+
+    def save(
+        self,
+        directory: str | Path,
+        *,
+        metrics: dict[str, Any] | None = None,
+        card: str | None = None,
+        **about: Any,
+    ) -> Path:
+        """Publish the agent as a directory that `load` reads, atomically.
+
+        Args:
+            directory: where; an earlier published directory there is replaced.
+            metrics: scores to keep beside the weights.
+            card: text of the README.md; a short one is written without it.
+            **about: plain facts for config.yaml, for example `task="pointmaze-large-diverse"`.
+
+        Returns:
+            The directory.
+
+        Raises:
+            UserError: the directory holds something that was not published.
+        """
+        from dds_lightning.checkpointing import publish
+
+        modules: dict[str, nn.Module] = {"skill": self.skill}
+        if self.policy is not None:
+            modules["policy"] = self.policy
+        acting: dict[str, Any] = {"selection": self.selection, "temperature": self.temperature}
+        acting["noise_scale"] = self.noise_scale
+        acting["fixed_codes"] = None if self.fixed_codes is None else self.fixed_codes.tolist()
+        return publish(directory, modules, {**about, "agent": acting}, metrics, card)
+
+    @classmethod
+    def load(cls, directory: str | Path, **settings: Any) -> Self:
+        """Load a published agent, without its data set, on the CPU.
+
+        Args:
+            directory: as written by `save` or `dds run`.
+            **settings: override `selection`, `temperature`, `noise_scale`, `fixed_codes`, `seed`.
+
+        Raises:
+            UserError: files are missing, changed, of a newer version, or do not fit; the message names them.
+        """
+        from dds_lightning.checkpointing import load_published
+        from dds_lightning.policy import PolicyModule
+        from dds_lightning.skill import SkillModule
+
+        published = load_published(directory)
+        skill = published.module(SkillModule, "skill")
+        policy = published.module(PolicyModule, "policy") if "policy" in published.config else None
+        acting = published.config.get("agent") or {"selection": "random" if policy is None else "sample"}
+        acting = {**acting, **settings}
+        if acting["selection"] != "fixed":
+            acting.pop("fixed_codes", None)
+        try:
+            return cls(skill, policy, **acting)
+        except TypeError as error:
+            raise UserError(
+                f"{directory}: an agent setting that this version does not know: {error}"
+            ) from None

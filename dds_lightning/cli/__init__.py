@@ -1,0 +1,114 @@
+"""The command line `dds`. Nothing heavy is imported before the command is known.
+
+A function of `commands` is a command: its signature is the command line and its docstring the help. `dds skill` and
+`dds policy` are Lightning's own command lines (`fitting`). What a command returns is printed, as text for a person or,
+with `--json`, as one JSON document with nothing beside it on standard output; progress and logs go to standard error.
+"""
+
+import shlex
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
+from typing import Any
+
+from dds_lightning import __version__
+from dds_lightning.errors import UserError
+from dds_lightning.interrupts import Interrupted, caught
+
+USAGE_ERROR = 2
+STAGES = {
+    "skill": "Stage one by itself: fit, validate, test or predict with the skill model.",
+    "policy": "Stage two by itself: fit, validate, test or predict with the policy.",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit status: 0, 2 for a user's mistake, 128 + signal when interrupted.
+
+    Args:
+        argv: the words after `dds`; None takes them from the process.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        with caught():
+            return _dispatch(words)
+    except UserError as error:
+        return _complain(str(error))
+    except Interrupted as stop:
+        print(f"dds: {_interrupted(words, stop)}", file=sys.stderr)
+        return int(stop.code or 1)
+    except BrokenPipeError:
+        # The reader has left (`dds tasks | head`); Python would complain again while closing standard output.
+        sys.stdout = None
+        return 0
+
+
+def _dispatch(words: list[str]) -> int:
+    from jsonargparse import ArgumentError
+
+    if words in (["--version"], ["-V"]):
+        print(f"dds-lightning {__version__}")
+        return 0
+    try:
+        if words and words[0] in STAGES:
+            from dds_lightning.cli.fitting import command
+
+            as_json, work = "--json" in words, command(words[0], words[1:])
+        else:
+            as_json, work = _command(words)
+    except ArgumentError as error:
+        asked = shlex.join(["dds", *(word for word in words[:2] if word.isalpha())])
+        return _complain(f"{str(error.message).strip()} (see `{asked} --help`)")
+    except SystemExit as stop:  # --help and --print_config end so
+        if isinstance(stop, Interrupted):
+            raise
+        return int(stop.code or 0)
+    return _report(work, as_json)
+
+
+def _command(words: list[str]) -> tuple[bool, Callable[[], Any]]:
+    """Parse the words of a command of ours."""
+    from dds_lightning.cli.parser import build_parser, prepare
+
+    parser, functions = build_parser()
+    config = parser.parse_args(prepare(words or ["--help"]))
+    name = config.pop("subcommand")
+    settings = config.pop(name)
+    while "subcommand" in settings:
+        inner = settings.pop("subcommand")
+        name, settings = f"{name} {inner}", settings.pop(inner)
+    settings.pop("config", None)
+    as_json = settings.pop("json", False)
+    return as_json, lambda: functions[name](**settings.as_dict())
+
+
+def _report(work: Callable[[], Any], as_json: bool) -> int:
+    """Do the work with standard output turned away, then print what it returned."""
+    from dds_lightning.cli.reports import Report
+
+    with redirect_stdout(sys.stderr):
+        report = work()
+    if isinstance(report, Report):
+        report.print(as_json)
+        return report.status
+    return 0
+
+
+def _complain(message: str) -> int:
+    print(f"dds: error: {message}", file=sys.stderr)
+    return USAGE_ERROR
+
+
+def _interrupted(words: list[str], stop: Interrupted) -> str:
+    """What was saved and which command goes on."""
+    if words[:1] == ["run"]:
+        return f"interrupted; the same command goes on where it stopped:\n  {shlex.join(['dds', *words])}"
+    if stop.saved is None:
+        return "interrupted"
+    kept, skip = [], False
+    for word in words:
+        if not skip and not word.startswith("--ckpt_path"):
+            kept.append(word)
+        skip = word == "--ckpt_path"
+    command = shlex.join(["dds", *kept, "--ckpt_path", stop.saved])
+    return f"interrupted; the state is in {stop.saved}, and this goes on from it:\n  {command}"

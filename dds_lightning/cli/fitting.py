@@ -1,0 +1,261 @@
+"""`dds skill` and `dds policy`: Lightning's command line over our modules, with its traps closed.
+
+- Dimensions come from the data (`data.observation_dim` -> `model.observation_dim`), never from the user.
+- `--ckpt_path` continues a training. The settings of the model come from the checkpoint; naming another value for
+  one of them is refused instead of being ignored.
+- A mistake in the data is found before the first file is written.
+"""
+
+import logging
+import shlex
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as pl
+import torch
+from jsonargparse import Namespace
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+
+from datamodules.relabeled import RelabeledDataModule
+from datamodules.segments import SegmentDataModule
+from dds_lightning import interrupts
+from dds_lightning.cli.configs import resolve_configs
+from dds_lightning.cli.reports import Report, table
+from dds_lightning.errors import UserError
+from dds_lightning.policy import PolicyModule
+from dds_lightning.skill import SkillModule
+from dds_lightning.training import BestCheckpoint, RollingCheckpoint, trainer_settings
+
+MODULES: dict[str, tuple[type[pl.LightningModule], type[pl.LightningDataModule]]] = {
+    "skill": (SkillModule, SegmentDataModule),
+    "policy": (PolicyModule, RelabeledDataModule),
+}
+LINKS = {"skill": ("observation_dim", "action_dim", "horizon"), "policy": ("observation_dim", "num_skills")}
+
+
+class StageCLI(LightningCLI):
+    """The command line of one stage; `execute` runs the subcommand, so that parsing and work are apart.
+
+    Args:
+        stage: `skill` or `policy`.
+        words: what follows `dds skill`.
+        parse_only: stop after parsing; `config` holds the settings.
+    """
+
+    def __init__(self, stage: str, words: Sequence[str], parse_only: bool = False) -> None:
+        self.stage = stage
+        self.parse_only = parse_only
+        self.words = resolve_configs(words)
+        self.checkpoint: dict[str, Any] | None = None
+        self.result: Report | None = None
+        parser = {"exit_on_error": False}
+        module, datamodule = MODULES[stage]
+        super().__init__(
+            module,
+            datamodule,
+            args=self.words,
+            save_config_kwargs={"overwrite": True},
+            seed_everything_default=0,
+            trainer_defaults={"default_root_dir": f"runs/{stage}", "max_epochs": -1},
+            parser_kwargs={"prog": f"dds {stage}", **parser, **dict.fromkeys(self.subcommands(), parser)},
+            auto_configure_optimizers=False,
+            load_from_checkpoint_support=False,  # our checkpoints name no class to import
+        )
+
+    # ---------------------------------------------------------------- the parser
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        """Add the checkpoints' settings, `--json`, and the links from data to model."""
+        parser.add_lightning_class_args(RollingCheckpoint, "checkpoint")
+        parser.add_lightning_class_args(BestCheckpoint, "best")
+        parser.link_arguments("checkpoint.dirpath", "best.dirpath", apply_on="parse")
+        parser.add_argument("--json", action="store_true", help="print one JSON document and nothing else")
+        for name in LINKS[self.stage]:
+            parser.link_arguments(f"data.{name}", f"model.{name}", apply_on="instantiate")
+
+    def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
+        """Parse the words given to us and never those of the process."""
+        self.config = parser.parse_args(args)
+
+    def _parse_ckpt_path(self) -> None:
+        """Take the model's settings from the checkpoint, and refuse to contradict it."""
+        settings = self.config[self.config.subcommand]
+        path = settings.get("ckpt_path")
+        if path is None:
+            if self.config.subcommand != "fit" and not self.parse_only:
+                raise UserError(
+                    f"--ckpt_path is missing: `dds {self.stage} {self.config.subcommand}` needs the checkpoint to "
+                    "look at"
+                )
+            return
+        if settings.model.get("init_from") is not None:
+            raise UserError(
+                "--ckpt_path continues a training and --model.init_from starts a new one from its weights: give one"
+            )
+        self.checkpoint = load_checkpoint(path, self.stage)
+        trained = dict(self.checkpoint["hyper_parameters"])
+        chosen = self._chosen_model_settings()
+        for name, value in trained.items():
+            if name in chosen and chosen[name] != value:
+                raise UserError(
+                    f"--model.{name} is {chosen[name]!r}, but checkpoint {path} was trained with {value!r}, and "
+                    "--ckpt_path continues exactly that training: leave the setting out, or train anew"
+                )
+            if name not in LINKS[self.stage] and name in settings.model:
+                settings.model[name] = value
+
+    def _chosen_model_settings(self) -> dict[str, Any]:
+        """Settings of the model that the user wrote down, on the command line or in a file; no defaults."""
+        given: Namespace = self.parser.parse_args(self.words, defaults=False)
+        model = given[self.config.subcommand].get("model") or Namespace()
+        return model.as_dict()
+
+    # ---------------------------------------------------------------- building
+
+    def _set_seed(self) -> None:
+        if not self.parse_only:
+            super()._set_seed()
+
+    def instantiate_classes(self) -> None:
+        """Build data, model and trainer, unless only the settings were asked for."""
+        if self.parse_only:
+            return
+        super().instantiate_classes()
+        trained = (self.checkpoint or {}).get("hyper_parameters", {})
+        for name in LINKS[self.stage]:
+            if name in trained and trained[name] != self.model.hparams[name]:
+                raise UserError(
+                    f"checkpoint {self._get(self.config, 'ckpt_path')} was trained with {name} {trained[name]}, the "
+                    f"data have {self.model.hparams[name]}: use a checkpoint and data of the same task"
+                )
+
+    def _instantiate_trainer(self, config: dict[str, Any], callbacks: list[pl.Callback]) -> pl.Trainer:
+        return super()._instantiate_trainer(trainer_settings(dict(config), callbacks), [])
+
+    def _run_subcommand(self, subcommand: str) -> None:
+        """Wait for `execute`."""
+
+    # ---------------------------------------------------------------- working
+
+    def execute(self) -> Report:
+        """Run the subcommand that was parsed."""
+        if self.trainer.world_size == 1:
+            # Lightning makes its log folder first and looks at the data afterwards.
+            self.datamodule.prepare_data()
+            self.datamodule.setup(str(self.subcommand))
+        work: Callable[..., Report] = getattr(self, f"_{self.subcommand}")
+        return work(**self._prepare_subcommand_kwargs(str(self.subcommand)))
+
+    def _fit(self, **kwargs: Any) -> Report:
+        kwargs["weights_only"] = True
+        with interrupts.deferred():
+            self.trainer.fit(**kwargs)
+        saved = {
+            "checkpoint": next(
+                (c.path for c in self.trainer.checkpoint_callbacks if isinstance(c, RollingCheckpoint)), None
+            ),
+            "best": next(
+                (c.best_model_path for c in self.trainer.checkpoint_callbacks if isinstance(c, BestCheckpoint)), None
+            )
+            or None,
+        }
+        data = {
+            **saved,
+            "steps": self.trainer.global_step,
+            "metrics": _numbers(self.trainer.callback_metrics),
+            "logs": self.trainer.log_dir,
+        }
+        lines = [f"{self.trainer.global_step:,} steps; logs in {self.trainer.log_dir}"]
+        lines += [f"{name}: {path}" for name, path in saved.items() if path]
+        return Report(data, lines)
+
+    def _validate(self, **kwargs: Any) -> Report:
+        return self._look(self.trainer.validate, kwargs)
+
+    def _test(self, **kwargs: Any) -> Report:
+        return self._look(self.trainer.test, kwargs)
+
+    def _look(self, method: Callable[..., Any], kwargs: dict[str, Any]) -> Report:
+        import pandas as pd
+
+        found = method(**{**kwargs, "verbose": False, "weights_only": True})
+        metrics = {name: value for loader in found for name, value in loader.items()}
+        rows = pd.DataFrame({"metric": list(metrics), "value": list(metrics.values())})
+        return Report({"checkpoint": kwargs["ckpt_path"], "metrics": metrics}, [table(rows, digits=4)])
+
+    def _predict(self, **kwargs: Any) -> Report:
+        import pandas as pd
+
+        kwargs |= {"return_predictions": True, "weights_only": True}
+        batches = self.trainer.predict(**kwargs) or []
+        codes = torch.cat([batch.reshape(-1) for batch in batches]).cpu().numpy()
+        folder = Path(self.trainer.log_dir or self.trainer.default_root_dir)
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / "predictions.parquet"
+        pd.DataFrame({"code": codes}).to_parquet(path)
+        counts = pd.Series(codes).value_counts().sort_index()
+        usage = pd.DataFrame({"code": counts.index, "count": counts.to_numpy()})
+        return Report({"file": path, "rows": len(codes), "codes": usage}, [table(usage), str(path)])
+
+
+def _numbers(metrics: dict[str, Any]) -> dict[str, float]:
+    return {name: float(value) for name, value in metrics.items()}
+
+
+def load_checkpoint(path: str, stage: str) -> dict[str, Any]:
+    """Read a Lightning checkpoint without running code from it.
+
+    Raises:
+        UserError: no such file, unreadable, or of another kind of model.
+    """
+    if not Path(path).is_file():
+        raise UserError(f"--ckpt_path: there is no file {path}")
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+        trained = checkpoint["hyper_parameters"]
+    except Exception as error:
+        reason = str(error).split("\n", 1)[0]
+        raise UserError(f"--ckpt_path: {path} is no readable Lightning checkpoint ({reason})") from error
+    marks = {"skill": "horizon", "policy": "tau"}
+    if marks[stage] not in trained:
+        other = next((name for name, mark in marks.items() if mark in trained), "other")
+        raise UserError(f"--ckpt_path: {path} is a checkpoint of a {other} model, expected a {stage} model")
+    return checkpoint
+
+
+def quieten() -> None:
+    """Silence what Lightning says at each start, and warnings about choices that were made on purpose."""
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    for text in (
+        ".*does not have many workers.*",
+        ".*Checkpoint directory .* exists and is not empty.*",
+        ".*You're resuming from a checkpoint that ended before the epoch ended.*",
+        ".*`IterableDataset` has `__len__` defined.*",
+    ):
+        warnings.filterwarnings("ignore", message=text)
+
+
+def command(stage: str, words: Sequence[str]) -> Callable[[], Report]:
+    """Parse the words after `dds skill` or `dds policy`; the result does the work."""
+    quieten()
+    if not words:
+        words = ["--help"]
+    return lambda: StageCLI(stage, words).execute()
+
+
+def settings_of(stage: str, words: Sequence[str]) -> dict[str, Any]:
+    """All settings of a `fit`, defaults included, as plain values: what `--print_config` prints."""
+    import yaml
+
+    cli = StageCLI(stage, words, parse_only=True)
+    parser = cli._parser(cli.config.subcommand)
+    text = parser.dump(cli.config[cli.config.subcommand], skip_unset=False, skip_validation=True)
+    return yaml.safe_load(text)
+
+
+def command_line(stage: str, words: Sequence[str]) -> str:
+    """The command a person would type for these words."""
+    return shlex.join(["dds", stage, *words])

@@ -1,0 +1,94 @@
+"""From functions to a command line."""
+
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from jsonargparse import ArgumentParser
+
+from dds_lightning.cli import STAGES, commands
+from dds_lightning.errors import UserError
+
+Commands = Mapping[str, Any]  # name -> function, a group of commands, or None for one of Lightning's
+
+COMMANDS: Commands = {
+    "run": commands.run,
+    "skill": None,
+    "policy": None,
+    "relabel": commands.relabel,
+    "evaluate": commands.evaluate,
+    "data": {
+        "collect": commands.data_collect,
+        "check": commands.data_check,
+        "list": commands.data_list,
+        "show": commands.data_show,
+    },
+    "tasks": commands.tasks,
+}
+GROUPS = {"data": "Collect, check, list and show data sets."}
+
+
+def build_parser() -> tuple[ArgumentParser, dict[str, Callable[..., Any]]]:
+    """Build the parser and the functions by the words that call them ("data check")."""
+    parser = ArgumentParser(
+        prog="dds",
+        description="Discrete diffusion skills for offline reinforcement learning.",
+        epilog="`dds COMMAND --help` explains one command; `dds --version` prints the version.",
+        exit_on_error=False,
+    )
+    functions: dict[str, Callable[..., Any]] = {}
+    _add(parser, COMMANDS, functions)
+    return parser, functions
+
+
+def _add(
+    parser: ArgumentParser, table: Commands, functions: dict[str, Callable[..., Any]], prefix: str = ""
+) -> None:
+    subcommands = parser.add_subcommands(required=True, metavar="COMMAND")
+    for name, entry in table.items():
+        if entry is None:
+            subcommands.add_subcommand(name, ArgumentParser(exit_on_error=False), help=STAGES[name])
+        elif isinstance(entry, Mapping):
+            group = ArgumentParser(description=GROUPS[name], exit_on_error=False)
+            subcommands.add_subcommand(name, group, help=GROUPS[name])  # before its own: jsonargparse's order
+            _add(group, entry, functions, prefix=f"{name} ")
+        else:
+            documentation = inspect.getdoc(entry) or ""
+            first = documentation.split("\n", 1)[0]
+            about = documentation.split("\nArgs:", 1)[0].strip()
+            leaf = ArgumentParser(description=about, exit_on_error=False)
+            leaf.add_argument("--json", action="store_true", help="print one JSON document and nothing else")
+            leaf.add_function_arguments(entry, as_group=False, as_positional=True)
+            subcommands.add_subcommand(name, leaf, help=first)
+            functions[prefix + name] = entry
+
+
+def prepare(words: list[str]) -> list[str]:
+    """Rewrite the two shorthands that jsonargparse does not know.
+
+    A bare `--fresh` means `--fresh=true`, and for `dds run` an option like `--skill.trainer.max_steps=100` (or the
+    same as two words) is collected for the `fit` command of that stage.
+
+    Raises:
+        UserError: such an option without a value.
+    """
+    flags = {
+        f"--{name}"
+        for function in (commands.run, commands.evaluate, commands.relabel, commands.data_collect)
+        for name, parameter in inspect.signature(function).parameters.items()
+        if parameter.default is False
+    }
+    out: list[str] = []
+    rest = iter(words)
+    for word in rest:
+        stage, _, option = word.removeprefix("--").partition(".")
+        if words[0] == "run" and word.startswith("--") and stage in STAGES and option:
+            if "=" not in option:
+                value = next(rest, None)
+                if value is None:
+                    raise UserError(f"{word} has no value: write {word}=VALUE")
+                option = f"{option}={value}"
+            out.append(f"--{stage}+=--{option}")
+        else:
+            out.append(f"{word}=true" if word in flags else word)
+    return out

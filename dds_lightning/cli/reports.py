@@ -1,0 +1,78 @@
+"""What a command has to say, once for people and once for programs."""
+
+import json
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from rich.console import RenderableType
+    from rich.table import Table
+
+
+@dataclass
+class Report:
+    """The result of a command.
+
+    Attributes:
+        data: what `--json` prints; anything made of dicts, lists, numbers, strings, arrays and tables.
+        text: what a person reads: lines and rich tables.
+        status: exit status of the command.
+    """
+
+    data: Any
+    text: Sequence["RenderableType"] = ()
+    status: int = 0
+
+    def print(self, as_json: bool) -> None:
+        """Print one of the two to standard output."""
+        if as_json:
+            print(json.dumps(plain(self.data), indent=2, allow_nan=False))
+            return
+        from rich.console import Console
+
+        # A pipe has no width: rich would cut a table at 80 columns, and `grep` would miss what was cut.
+        console = Console(soft_wrap=True) if sys.stdout.isatty() else Console(width=200, soft_wrap=True)
+        for line in self.text:
+            console.print(line, highlight=False, markup=False)
+
+
+def plain(value: Any) -> Any:
+    """Turn tables, arrays, paths and tuples into what JSON can say; a number that is not finite becomes null."""
+    if hasattr(value, "to_dict") and hasattr(value, "columns"):
+        return [plain(row) for row in value.to_dict(orient="records")]
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Path):
+        return str(value)
+    return value
+
+
+def table(frame: "pd.DataFrame", title: str | None = None, digits: int = 3) -> "Table":
+    """Draw a DataFrame as a rich table: numbers to the right, missing values as a dash."""
+    from rich import box
+    from rich.table import Table
+
+    drawn = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    for column in frame.columns:
+        numeric = frame[column].dtype.kind in "iuf"
+        drawn.add_column(str(column), justify="right" if numeric else "left", overflow="fold")
+    for row in frame.itertuples(index=False):
+        drawn.add_row(*(_cell(value, digits) for value in row))
+    return drawn
+
+
+def _cell(value: Any, digits: int) -> str:
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return "-"
+    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,37 @@
+"""Metrics in torchmetrics' form: they accumulate over an epoch, reset themselves and sync across processes."""
+
+import torch
+from torch import Tensor
+from torchmetrics import Metric
+
+
+class CodebookUsage(Metric):
+    """How a codebook is used over an epoch: perplexity, codes in use, dead codes.
+
+    A code is *in use* when its share of the epoch reaches ``threshold / K``. Perplexity is ``exp(H)`` of the code
+    distribution: K when all are used alike, 1 after a collapse. Measured over an epoch: a single batch of a few
+    hundred segments calls rare codes dead.
+
+    Args:
+        num_skills: K.
+        threshold: share of the uniform usage 1 / K from which a code counts as used.
+    """
+
+    full_state_update = False
+    counts: Tensor
+
+    def __init__(self, num_skills: int, threshold: float = 0.05) -> None:
+        super().__init__()
+        self.threshold = threshold
+        self.add_state("counts", default=torch.zeros(num_skills), dist_reduce_fx="sum")
+
+    def update(self, codes: Tensor) -> None:
+        """Count codes (B,)."""
+        self.counts += torch.bincount(codes.flatten(), minlength=len(self.counts)).to(self.counts)
+
+    def compute(self) -> dict[str, Tensor]:
+        """Return ``perplexity``, ``codes_used`` and ``dead_codes`` as scalars."""
+        share = self.counts / self.counts.sum().clamp_min(1.0)  # (K,)
+        entropy = -torch.special.xlogy(share, share).sum()
+        used = (share >= self.threshold / len(share)).sum().float()
+        return {"perplexity": entropy.exp(), "codes_used": used, "dead_codes": len(share) - used}

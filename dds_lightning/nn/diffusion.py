@@ -1,0 +1,225 @@
+"""Action decoders: skill vector and state to action, by denoising or directly (section 4.1, appendix A.1.2)."""
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+Sampler = Literal["ddpm", "ddim"]
+
+
+def vp_betas(steps: int, beta_min: float = 0.1, beta_max: float = 10.0) -> Tensor:
+    """Variance-preserving schedule (Song et al., 2021, discretised as in DDPM-style policies).
+
+    ``1 - beta_t = exp(-beta_min / T - (beta_max - beta_min) (2 t - 1) / (2 T^2))`` for t = 1..T.
+
+    Returns:
+        (T,) beta_t in float64; T = 5 with 0.1..10 gives .196 .459 .636 .755 .835.
+    """
+    t = torch.arange(1, steps + 1, dtype=torch.float64)
+    return 1.0 - torch.exp(-beta_min / steps - 0.5 * (beta_max - beta_min) * (2.0 * t - 1.0) / steps**2)
+
+
+def sinusoidal_embedding(t: Tensor, dim: int) -> Tensor:
+    """Sines and cosines of integer time steps: (B,) to (B, dim), dim even."""
+    half = dim // 2
+    frequencies = torch.exp(-math.log(10_000.0) * torch.arange(half, device=t.device) / max(half - 1, 1))
+    phase = t.float()[:, None] * frequencies
+    return torch.cat([phase.sin(), phase.cos()], dim=-1)
+
+
+class ResidualBlock(nn.Module):
+    """Layer norm, expansion by four, ReLU, compression, added to the input."""
+
+    def __init__(self, dim: int, dropout: float) -> None:
+        super().__init__()
+        self.net = nn.Sequential(
+            nn.LayerNorm(dim), nn.Dropout(dropout), nn.Linear(dim, 4 * dim), nn.ReLU(), nn.Linear(4 * dim, dim)
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, dim) to (B, dim)."""
+        return x + self.net(x)
+
+
+class ResidualMLP(nn.Module):
+    """The layer-normalised residual backbone that both decoders share.
+
+    Args:
+        input_dim: width of the concatenated input.
+        output_dim: A.
+        hidden_dim: width of the blocks.
+        blocks: number of residual blocks.
+        dropout: rate inside the blocks.
+    """
+
+    def __init__(
+        self, input_dim: int, output_dim: int, hidden_dim: int = 256, blocks: int = 4, dropout: float = 0.1
+    ) -> None:
+        super().__init__()
+        self.input = nn.Linear(input_dim, hidden_dim)
+        self.blocks = nn.Sequential(*(ResidualBlock(hidden_dim, dropout) for _ in range(blocks)))
+        self.output = nn.Linear(hidden_dim, output_dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, input_dim) to (B, output_dim)."""
+        return self.output(self.blocks(self.input(x)))
+
+
+class DiffusionDecoder(nn.Module):
+    """Noise prediction network and its samplers; actions live in [-1, 1].
+
+    Args:
+        observation_dim: O.
+        action_dim: A.
+        skill_dim: D.
+        hidden_dim: width of the backbone.
+        blocks: residual blocks.
+        dropout: rate inside the blocks.
+        diffusion_steps: T.
+        beta_min: start of the VP schedule.
+        beta_max: end of the VP schedule.
+        time_dim: width of the time embedding.
+        sampler: ``ddpm`` draws from the posterior, ``ddim`` follows the deterministic path (Song et al., 2020).
+        clip: keep the predicted x0 in [-1, 1] at every step.
+    """
+
+    betas: Tensor
+    alpha_bars: Tensor
+    time_table: Tensor
+
+    def __init__(
+        self,
+        observation_dim: int,
+        action_dim: int,
+        skill_dim: int,
+        hidden_dim: int = 256,
+        blocks: int = 4,
+        dropout: float = 0.1,
+        diffusion_steps: int = 5,
+        beta_min: float = 0.1,
+        beta_max: float = 10.0,
+        time_dim: int = 16,
+        sampler: Sampler = "ddpm",
+        clip: bool = True,
+    ) -> None:
+        super().__init__()
+        self.action_dim, self.diffusion_steps = action_dim, diffusion_steps
+        self.sampler, self.clip = sampler, clip
+        self.net = ResidualMLP(
+            action_dim + time_dim + skill_dim + observation_dim, action_dim, hidden_dim, blocks, dropout
+        )
+        betas = vp_betas(diffusion_steps, beta_min, beta_max)
+        self.register_buffer("betas", betas.float())
+        self.register_buffer("alpha_bars", torch.cumprod(1.0 - betas, dim=0).float())
+        times = torch.arange(1, diffusion_steps + 1)
+        self.register_buffer("time_table", sinusoidal_embedding(times, time_dim))
+
+    def predict_noise(self, noisy: Tensor, t: Tensor, observations: Tensor, skills: Tensor) -> Tensor:
+        """epsilon_psi(x_t, t, z, s): noisy (B, A), t (B,) in 0..T-1, observations (B, O), skills (B, D) to (B, A)."""
+        return self.net(torch.cat([noisy, self.time_table[t], skills, observations], dim=-1))
+
+    def loss(self, actions: Tensor, observations: Tensor, skills: Tensor) -> Tensor:
+        """Squared error of the predicted noise (equation 5), one t and one epsilon a row.
+
+        Args:
+            actions: (B, A) in [-1, 1].
+            observations: (B, O) normalised.
+            skills: (B, D).
+
+        Returns:
+            (B, A), not yet reduced: the sum over H and A stands beside the VQ terms.
+        """
+        t = torch.randint(self.diffusion_steps, (len(actions),), device=actions.device)
+        noise = torch.randn_like(actions)
+        alpha_bar = self.alpha_bars[t, None]  # (B, 1)
+        noisy = alpha_bar.sqrt() * actions + (1.0 - alpha_bar).sqrt() * noise
+        return (self.predict_noise(noisy, t, observations, skills) - noise).square()
+
+    def sample(
+        self,
+        observations: Tensor,
+        skills: Tensor,
+        noise_scale: float = 1.0,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Denoise Gaussian noise into actions in T steps (section 4.4).
+
+        Args:
+            observations: (B, O) normalised.
+            skills: (B, D).
+            noise_scale: factor on every Gaussian that is drawn, the first as well; 1 is the model's own
+                distribution, less is nearer to its mode, 0 draws nothing and is deterministic.
+            generator: random stream; the global one without it.
+
+        Returns:
+            (B, A), in [-1, 1] when ``clip`` is set.
+        """
+        size = (len(observations), self.action_dim)
+        device = observations.device
+
+        def draw() -> Tensor:
+            return noise_scale * torch.randn(size, device=device, generator=generator)
+
+        x = draw()
+        for i in reversed(range(self.diffusion_steps)):
+            t = torch.full((size[0],), i, device=device)
+            noise = self.predict_noise(x, t, observations, skills)
+            alpha_bar = self.alpha_bars[i]
+            x0 = (x - (1.0 - alpha_bar).sqrt() * noise) / alpha_bar.sqrt()
+            if self.clip:
+                x0 = x0.clamp(-1.0, 1.0)
+            if i == 0:
+                return x0
+            previous = self.alpha_bars[i - 1]
+            if self.sampler == "ddim":
+                # The noise that leads to the clipped x0, so that the path ends there.
+                noise = (x - alpha_bar.sqrt() * x0) / (1.0 - alpha_bar).sqrt()
+                x = previous.sqrt() * x0 + (1.0 - previous).sqrt() * noise
+                continue
+            beta = self.betas[i]
+            mean = (previous.sqrt() * beta * x0 + (1.0 - beta).sqrt() * (1.0 - previous) * x) / (1.0 - alpha_bar)
+            variance = beta * (1.0 - previous) / (1.0 - alpha_bar)
+            x = mean + variance.sqrt() * draw()
+        raise AssertionError("unreachable: the loop returns at i = 0")
+
+
+class MLPDecoder(nn.Module):
+    """The diffusion decoder's backbone as a plain regressor, for the architecture ablation (section 5.4).
+
+    Args:
+        observation_dim: O.
+        action_dim: A.
+        skill_dim: D.
+        hidden_dim: width of the backbone.
+        blocks: residual blocks.
+        dropout: rate inside the blocks.
+    """
+
+    def __init__(
+        self,
+        observation_dim: int,
+        action_dim: int,
+        skill_dim: int,
+        hidden_dim: int = 256,
+        blocks: int = 4,
+        dropout: float = 0.1,
+    ) -> None:
+        super().__init__()
+        self.net = ResidualMLP(skill_dim + observation_dim, action_dim, hidden_dim, blocks, dropout)
+
+    def loss(self, actions: Tensor, observations: Tensor, skills: Tensor) -> Tensor:
+        """Squared error of the action (equation 13, first term); shapes as in `DiffusionDecoder.loss`."""
+        return (self.sample(observations, skills) - actions).square()
+
+    def sample(
+        self,
+        observations: Tensor,
+        skills: Tensor,
+        noise_scale: float = 1.0,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Predict actions (B, A); there is no noise to scale or draw."""
+        del noise_scale, generator
+        return self.net(torch.cat([skills, observations], dim=-1)).tanh()

@@ -1,0 +1,78 @@
+"""Multi-layer perceptrons, one or an ensemble of them at once, with optional layer norm and Fourier features."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+
+class EnsembleLinear(nn.Module):
+    """N independent linear layers as one batched product: (N, B, I) to (N, B, J)."""
+
+    def __init__(self, members: int, input_dim: int, output_dim: int) -> None:
+        super().__init__()
+        bound = 1.0 / math.sqrt(input_dim)  # the start of nn.Linear
+        self.weight = nn.Parameter(torch.empty(members, input_dim, output_dim).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.empty(members, 1, output_dim).uniform_(-bound, bound))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Apply member n to x[n]."""
+        return torch.baddbmm(self.bias, x, self.weight)
+
+
+class FourierFeatures(nn.Module):
+    """Random sines and cosines of the input beside the input itself, so that a small network sees sharp edges.
+
+    A plain ReLU network of two layers smooths a value function across a thin wall (Tancik et al., 2020). The
+    frequencies are drawn once and kept as a buffer.
+
+    Args:
+        input_dim: width of the input.
+        features: number of frequencies F; the output has input_dim + 2 F dimensions.
+        scale: standard deviation of the frequencies, in cycles per unit of normalised input times 2 pi.
+    """
+
+    frequencies: Tensor
+
+    def __init__(self, input_dim: int, features: int, scale: float) -> None:
+        super().__init__()
+        self.register_buffer("frequencies", scale * torch.randn(input_dim, features))
+        self.output_dim = input_dim + 2 * features
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (..., I) to (..., I + 2 F)."""
+        phase = x @ self.frequencies
+        return torch.cat([x, phase.sin(), phase.cos()], dim=-1)
+
+
+class MLP(nn.Sequential):
+    """Linear layers with ReLU between them; ``members`` > 0 makes an ensemble with a leading axis.
+
+    Args:
+        input_dim: width of the input.
+        output_dim: width of the output.
+        hidden_dims: widths of the hidden layers (the paper: 256, 256).
+        layer_norm: normalise before each ReLU.
+        members: 0 for a plain network (..., I) to (..., J); N for an ensemble (N, B, I) to (N, B, J).
+    """
+
+    def __init__(
+        self,
+        input_dim: int,
+        output_dim: int,
+        hidden_dims: Sequence[int] = (256, 256),
+        layer_norm: bool = False,
+        members: int = 0,
+    ) -> None:
+        def linear(i: int, j: int) -> nn.Module:
+            return EnsembleLinear(members, i, j) if members else nn.Linear(i, j)
+
+        layers: list[nn.Module] = []
+        for hidden_dim in hidden_dims:
+            layers.append(linear(input_dim, hidden_dim))
+            if layer_norm:
+                layers.append(nn.LayerNorm(hidden_dim))
+            layers.append(nn.ReLU())
+            input_dim = hidden_dim
+        super().__init__(*layers, linear(input_dim, output_dim))

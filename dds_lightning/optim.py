@@ -1,0 +1,44 @@
+"""The one optimiser both stages use: Adam with an optional warm-up and cosine decay."""
+
+import math
+from collections.abc import Iterable
+from typing import Any, Literal
+
+import lightning.pytorch as pl
+import torch
+from torch import nn
+
+Schedule = Literal["constant", "cosine"]
+
+
+def learning_rate_factor(step: int, schedule: Schedule, warmup_steps: int, max_steps: int) -> float:
+    """Factor on the learning rate at ``step``: linear warm-up, then 1 or half a cosine down to 0 at ``max_steps``."""
+    if step < warmup_steps:
+        return (step + 1) / warmup_steps
+    if schedule == "constant" or max_steps <= warmup_steps:
+        return 1.0
+    progress = min(1.0, (step - warmup_steps) / (max_steps - warmup_steps))
+    return 0.5 * (1.0 + math.cos(math.pi * progress))
+
+
+def adam(
+    parameters: Iterable[nn.Parameter],
+    lr: float,
+    schedule: Schedule,
+    warmup_steps: int,
+    module: pl.LightningModule,
+) -> Any:
+    """Build Adam in the form Lightning expects.
+
+    Reads ``trainer.max_steps`` only: ``estimated_stepping_batches`` builds the loaders early and breaks resuming.
+    """
+    optimizer = torch.optim.Adam([p for p in parameters if p.requires_grad], lr=lr)
+    if schedule == "constant" and warmup_steps == 0:
+        return optimizer
+    max_steps = module.trainer.max_steps
+
+    def factor(step: int) -> float:
+        return learning_rate_factor(step, schedule, warmup_steps, max_steps)
+
+    scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
+    return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}

@@ -1,0 +1,338 @@
+"""Stages two and three: discrete IQL over codes, then a policy by advantage-weighted regression (section 4.3).
+
+```
+ (s, k, R, s', discount, done) ─► V(s) ◄─ expectile tau ─ min target Q(s, k)      equation 6
+                                  Q(s, k) ◄─ R + discount (1 - done) V(s')        equation 8
+                                  pi(k | s) ◄─ exp(alpha (Q - V)) log pi(k | s)   equation 9
+```
+
+One Adam minimises the sum of the losses: their parameters are disjoint and every target carries a stop-gradient, so
+the step is the same as three optimisers stepping at once. (The original IQL updates V, then policy, then Q, each on
+the networks just updated.)
+"""
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import lightning.pytorch as pl
+import torch
+from torch import Tensor, nn
+
+from dds_lightning import losses
+from dds_lightning.errors import UserError
+from dds_lightning.nn.mlp import MLP, FourierFeatures
+from dds_lightning.nn.normaliser import Normaliser
+from dds_lightning.optim import adam
+
+Selection = Literal["sample", "greedy", "argmax_q"]
+
+
+class PolicyModule(pl.LightningModule):
+    """Discrete IQL and AWR over the codes of a relabelled data set.
+
+    A training batch is ``{"observations": (B, O), "codes": (B,), "rewards": (B,), "next_observations": (B, O),
+    "discounts": (B,), "dones": (B,)}``. The defaults are the paper's (table 7); where the paper is silent (``alpha``,
+    ``weight_clip``) they are IQL's.
+
+    Args:
+        observation_dim: O, linked from the data on the command line.
+        num_skills: K, linked from the data.
+        hidden_dims: widths of value, Q and policy networks.
+        layer_norm: normalise before each ReLU of value and Q networks.
+        fourier_features: frequencies given to value, Q and policy networks beside the observation; 0 for none. They
+            let a small network see a thin wall early (named departure from the paper).
+        fourier_scale: standard deviation of those frequencies.
+        tau: expectile of the value loss.
+        alpha: temperature of AWR; larger follows the critic more closely. One preset with the rewards' scale.
+        weight_clip: upper bound of the AWR weights.
+        target_ema: rate of the target network.
+        extraction: ``after`` trains the critic for ``critic_steps``, then the policy on the frozen critic (the
+            paper); ``joint`` trains them together.
+        critic_steps: steps of the critic with ``after``; the remaining steps up to ``max_steps`` go to the policy.
+        support: codes seen less often than this share of the data are never chosen.
+        lr: Adam's learning rate.
+        lr_schedule: ``constant`` (the paper) or ``cosine`` decay to zero at ``max_steps``.
+        warmup_steps: steps of linear warm-up.
+        watch: look every so many steps whether the critic left the range that rewards and discounts allow.
+
+    Raises:
+        UserError: a setting outside its range; the message names it.
+    """
+
+    support_mask: Tensor
+    value_range: Tensor
+
+    def __init__(
+        self,
+        observation_dim: int,
+        num_skills: int,
+        hidden_dims: Sequence[int] = (256, 256),
+        layer_norm: bool = False,
+        fourier_features: int = 0,
+        fourier_scale: float = 1.0,
+        tau: float = 0.7,
+        alpha: float = 3.0,
+        weight_clip: float = 100.0,
+        target_ema: float = 0.005,
+        extraction: Literal["after", "joint"] = "after",
+        critic_steps: int = 1_000_000,
+        support: float = 0.001,
+        lr: float = 1e-4,
+        lr_schedule: Literal["constant", "cosine"] = "constant",
+        warmup_steps: int = 0,
+        watch: int = 500,
+    ) -> None:
+        super().__init__()
+        hidden_dims = list(hidden_dims)
+        self.save_hyperparameters()
+        self._check_settings()
+        self.num_skills = num_skills
+        self.normaliser = Normaliser(observation_dim)
+        self.features: nn.Module = nn.Identity()
+        width = observation_dim
+        if fourier_features:
+            self.features = FourierFeatures(observation_dim, fourier_features, fourier_scale)
+            width = self.features.output_dim
+        self.value = MLP(width, 1, hidden_dims, layer_norm)
+        self.critic = MLP(width, num_skills, hidden_dims, layer_norm, members=2)
+        self.target_critic = MLP(width, num_skills, hidden_dims, layer_norm, members=2)
+        self.target_critic.load_state_dict(self.critic.state_dict())
+        self.target_critic.requires_grad_(False)
+        self.actor = MLP(width, num_skills, hidden_dims)
+        # Which codes the data support, and what values its rewards and discounts allow; filled at the fit's start.
+        self.register_buffer("support_mask", torch.ones(num_skills, dtype=torch.bool))
+        self.register_buffer("value_range", torch.tensor([-torch.inf, torch.inf]))
+
+    def _check_settings(self) -> None:
+        h = self.hparams
+        rules = [
+            ("num_skills", h.num_skills >= 2, "at least 2: with one code there is nothing to choose"),
+            ("tau", 0 < h.tau < 1, "in (0, 1)"),
+            ("alpha", h.alpha >= 0, "0 or more"),
+            ("weight_clip", h.weight_clip > 0, "positive"),
+            ("target_ema", 0 < h.target_ema <= 1, "in (0, 1]"),
+            ("support", 0 <= h.support < 1 / h.num_skills, f"in [0, 1/{h.num_skills})"),
+            ("lr", h.lr > 0, "positive"),
+        ]
+        for name, fine, expected in rules:
+            if not fine:
+                raise UserError(f"model.{name} is {h[name]}, expected {expected}")
+
+    # ---------------------------------------------------------------- what it says about a state
+
+    def embed(self, observations: Tensor) -> Tensor:
+        """Normalise observations (B, O) and append Fourier features."""
+        return self.features(self.normaliser(observations))
+
+    def v(self, observations: Tensor) -> Tensor:
+        """V(s): (B, O) to (B,)."""
+        return self.value(self.embed(observations)).squeeze(-1)
+
+    def q(self, observations: Tensor) -> Tensor:
+        """The lesser of the two target critics for every code: (B, O) to (B, K)."""
+        return self._ensemble(self.target_critic, self.embed(observations)).amin(dim=0)
+
+    def logits(self, observations: Tensor) -> Tensor:
+        """Unnormalised log pi(k | s): (B, O) to (B, K); -inf for codes without support in the data."""
+        return self.actor(self.embed(observations)).masked_fill(~self.support_mask, -torch.inf)
+
+    def codes(
+        self,
+        observations: Tensor,
+        selection: Selection = "sample",
+        temperature: float = 1.0,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Choose a code for each state.
+
+        Args:
+            observations: (B, O).
+            selection: ``sample`` from pi, ``greedy`` argmax of pi, ``argmax_q`` of the target critic.
+            temperature: divides the logits before sampling; below 1 is nearer to greedy.
+            generator: random stream; the global one without it.
+
+        Returns:
+            (B,) int64, only codes that the data support.
+        """
+        if selection == "argmax_q":
+            return self.q(observations).masked_fill(~self.support_mask, -torch.inf).argmax(dim=-1)
+        logits = self.logits(observations)
+        if selection == "greedy":
+            return logits.argmax(dim=-1)
+        probabilities = (logits / temperature).softmax(dim=-1)
+        return torch.multinomial(probabilities, 1, generator=generator).squeeze(-1)
+
+    @staticmethod
+    def _ensemble(critic: nn.Module, features: Tensor) -> Tensor:
+        """Both critics on the same features (B, F): (2, B, K)."""
+        return critic(features.expand(2, *features.shape))
+
+    # ---------------------------------------------------------------- losses
+
+    @property
+    def learns_critic(self) -> bool:
+        """Whether V and Q learn in this step."""
+        return self.hparams.extraction == "joint" or self.global_step < self.hparams.critic_steps
+
+    @property
+    def learns_actor(self) -> bool:
+        """Whether the policy learns in this step."""
+        return self.hparams.extraction == "joint" or not self.learns_critic
+
+    def critic_loss(
+        self, features: Tensor, v: Tensor, target_q: Tensor, batch: dict[str, Tensor]
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Equations 6 to 8: expectile regression of V and TD error of both Q.
+
+        Args:
+            features: (B, F) of the states.
+            v: (B,) V(s), with gradient.
+            target_q: (B,) lesser target Q of the codes taken.
+            batch: the semi-MDP transitions.
+        """
+        value_loss = losses.expectile(target_q - v, self.hparams.tau)
+        with torch.no_grad():
+            next_v = self.v(batch["next_observations"])
+            target = losses.td_target(batch["rewards"], batch["discounts"], batch["dones"], next_v)
+        index = batch["codes"].expand(2, -1).unsqueeze(-1)  # (2, B, 1)
+        q = self._ensemble(self.critic, features).gather(-1, index).squeeze(-1)  # (2, B)
+        q_loss = losses.td(q, target)
+        return value_loss + q_loss, {"value_loss": value_loss, "q_loss": q_loss}
+
+    def actor_loss(
+        self, features: Tensor, advantages: Tensor, codes: Tensor
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Equation 9: regression on the codes of the data, weighted by exp(alpha A); (B, F), (B,), (B,)."""
+        h = self.hparams
+        weights = losses.awr_weights(advantages.detach(), h.alpha, h.weight_clip)
+        log_pi = self.actor(features).log_softmax(dim=-1).gather(-1, codes[:, None]).squeeze(-1)
+        info = {
+            "clipped_share": (weights >= h.weight_clip).float().mean(),
+            "effective_sample_size": losses.effective_sample_size(weights),
+        }
+        return losses.awr(log_pi, weights), info
+
+    def loss(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
+        """Sum of the losses that learn in this step, and its terms and statistics."""
+        features = self.embed(batch["observations"])  # (B, F)
+        codes = batch["codes"]
+        with torch.no_grad():
+            target_q = self._ensemble(self.target_critic, features).amin(dim=0)  # (B, K)
+            target_q = target_q.gather(-1, codes[:, None]).squeeze(-1)  # (B,)
+        with torch.set_grad_enabled(self.learns_critic and torch.is_grad_enabled()):
+            v = self.value(features).squeeze(-1)  # (B,)
+        total = features.new_zeros(())
+        info: dict[str, Tensor] = {"v_mean": v.mean(), "v_min": v.min(), "v_max": v.max(), "q_mean": target_q.mean()}
+        if self.learns_critic:
+            critic_loss, terms = self.critic_loss(features, v, target_q, batch)
+            total = total + critic_loss
+            info.update(terms)
+        if self.learns_actor:
+            actor_loss, terms = self.actor_loss(features, target_q - v, codes)
+            total = total + actor_loss
+            info.update(terms, actor_loss=actor_loss)
+        return total, {name: value.detach() for name, value in info.items()}
+
+    # ---------------------------------------------------------------- Lightning
+
+    def on_fit_start(self) -> None:
+        """Take statistics, code support and possible values from the relabelled data."""
+        datamodule = getattr(self.trainer, "datamodule", None)
+        if bool(self.normaliser.fitted):
+            return
+        if datamodule is None or not hasattr(datamodule, "statistics"):
+            raise UserError(
+                "the policy has no statistics of the data: fit it with a RelabeledDataModule, or call "
+                "fit_statistics(...) first"
+            )
+        self.fit_statistics(**datamodule.statistics())
+
+    def fit_statistics(
+        self,
+        observation_mean: Tensor,
+        observation_std: Tensor,
+        code_share: Tensor,
+        reward_range: tuple[float, float],
+        max_discount: float,
+        **_: Any,
+    ) -> None:
+        """Set the normaliser, the mask of supported codes and the range in which values are possible.
+
+        Args:
+            observation_mean: (O,).
+            observation_std: (O,).
+            code_share: (K,) share of each code in the data.
+            reward_range: least and greatest reward of a semi-MDP transition.
+            max_discount: greatest discount of a transition.
+        """
+        self.normaliser.fit(observation_mean, observation_std)
+        self.support_mask.copy_(code_share >= max(self.hparams.support, 1e-12))
+        if max_discount < 1.0:
+            low, high = (reward / (1.0 - max_discount) for reward in reward_range)
+            self.value_range.copy_(torch.tensor([min(low, 0.0), max(high, 0.0)]))
+
+    def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
+        """One optimiser step's loss."""
+        total, info = self.loss(batch)
+        if self.global_step % self.trainer.log_every_n_steps == 0:
+            self.log_dict({f"train/{name}": value for name, value in info.items()})
+        if self.global_step % self.hparams.watch == 0:
+            self._watch(info)
+        return total
+
+    def _watch(self, info: dict[str, Tensor]) -> None:
+        """Warn, in plain words, when the critic's values are no possible sums of rewards."""
+        low, high = self.value_range.tolist()
+        least, greatest = info["v_min"].item(), info["v_max"].item()
+        slack = 0.1 * (high - low) if high - low < float("inf") else float("inf")
+        if least < low - slack or greatest > high + slack:
+            warnings.warn(
+                f"step {self.global_step}: V runs from {least:.3g} to {greatest:.3g}, but the data's rewards and "
+                f"discounts allow only {low:.3g} to {high:.3g}: the critic diverges. Check that terminations are "
+                "in the data, scale the rewards down, or lower lr or tau.",
+                stacklevel=2,
+            )
+        if "clipped_share" in info and info["clipped_share"].item() > 0.5:
+            warnings.warn(
+                f"step {self.global_step}: {100 * info['clipped_share'].item():.0f} % of the AWR weights are clipped "
+                f"at {self.hparams.weight_clip:g}: the policy clones them all alike. Lower alpha or the rewards' scale.",
+                stacklevel=2,
+            )
+
+    @torch.no_grad()
+    def on_train_batch_end(self, outputs: Any, batch: dict[str, Tensor], batch_idx: int) -> None:
+        """Move the target critic towards the critic."""
+        target, online = list(self.target_critic.parameters()), list(self.critic.parameters())
+        torch._foreach_lerp_(target, online, self.hparams.target_ema)
+
+    def validation_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
+        """Losses on held-out transitions."""
+        self._evaluate(batch, "val")
+
+    def test_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
+        """As `validation_step`."""
+        self._evaluate(batch, "test")
+
+    def _evaluate(self, batch: dict[str, Tensor], stage: str) -> None:
+        _, info = self.loss(batch)
+        log_pi = self.logits(batch["observations"]).log_softmax(dim=-1)
+        info["code_accuracy"] = (log_pi.argmax(dim=-1) == batch["codes"]).float().mean()
+        info["entropy"] = -torch.special.xlogy(log_pi.exp(), log_pi.exp()).sum(dim=-1).mean()
+        self.log_dict({f"{stage}/{k}": x for k, x in info.items()}, batch_size=len(batch["codes"]))
+
+    def predict_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
+        """Greedy codes (B,) for the states of a batch."""
+        return self.codes(batch["observations"], "greedy")
+
+    def configure_optimizers(self) -> Any:
+        """Adam over value, critic and policy together; a part that does not learn has no gradient and stays."""
+        return adam(self.parameters(), self.hparams.lr, self.hparams.lr_schedule, self.hparams.warmup_steps, self)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Load a policy from a Lightning ``.ckpt`` or a published directory, in evaluation mode on the CPU."""
+        from dds_lightning.checkpointing import load_module
+
+        return load_module(cls, path, part="policy")

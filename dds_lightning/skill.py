@@ -1,0 +1,341 @@
+"""Stage one: encoder, codebook and decoder learn skills together (section 4.1, equations 10 to 14).
+
+```
+ s_1..s_H, a_1..a_H ──► encoder ──► E(tau) ──► codebook ──► z_k ──┐         (B, H, O), (B, H, A) ─► (B, D)
+                                       ▲  straight-through   ▲    ▼
+                                       └── commitment ──┴ codebook   decoder(z_k, s_i) ──► a_i, every i of H
+```
+"""
+
+from itertools import islice
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import lightning.pytorch as pl
+import torch
+from torch import Tensor
+from torchmetrics import MeanMetric
+
+from dds_lightning.errors import UserError
+from dds_lightning.metrics import CodebookUsage
+from dds_lightning.nn.codebook import Codebook, CodebookInit, Quantised
+from dds_lightning.nn.diffusion import DiffusionDecoder, MLPDecoder, Sampler
+from dds_lightning.nn.encoder import ENCODERS
+from dds_lightning.nn.gaussian import GaussianBottleneck, GaussianSkill
+from dds_lightning.nn.normaliser import ActionBox, Normaliser
+from dds_lightning.optim import adam
+
+START_BATCHES = 64
+"""Batches whose encodings start the codebook by k-means."""
+
+
+class SkillModule(pl.LightningModule):
+    """Learn K discrete skills from segments of H steps.
+
+    A training batch is ``{"observations": (B, H, O), "actions": (B, H, A)}`` in the environment's own units;
+    normalisation is part of the module. The defaults are the paper's (tables 4, 5 and 6), save ``codebook_init`` and
+    ``restart_threshold``, whose paper-like values are ``uniform`` and 0.
+
+    Args:
+        observation_dim: O, linked from the data on the command line.
+        action_dim: A, linked from the data.
+        horizon: H, steps a skill lasts; linked from the data.
+        num_skills: K, at least 2.
+        skill_dim: D.
+        encoder: ``transformer`` (the paper) or ``gru`` of the same size.
+        decoder: ``diffusion`` (the paper) or ``mlp``, the same backbone as a regressor.
+        bottleneck: ``vq`` for discrete skills, ``gaussian`` for the continuous comparison.
+        hidden_dim: width of encoder and decoder.
+        encoder_layers: transformer or GRU layers.
+        encoder_heads: attention heads.
+        decoder_blocks: residual blocks of the decoder.
+        dropout: rate in encoder and decoder.
+        diffusion_steps: T.
+        beta_min: start of the VP schedule.
+        beta_max: end of the VP schedule.
+        time_dim: width of the time embedding.
+        sampler: ``ddpm`` or ``ddim``.
+        noise_scale: factor on the noise drawn while acting (1: the model's own distribution).
+        clip_actions: keep the predicted x0 in the action box while sampling.
+        reconstruction: ``sum`` over H and A as in equation 13, or ``mean``. It sets how the denoising loss weighs
+            against the codebook terms.
+        commitment: beta of equation 14.
+        kl_weight: weight of the KL term of the Gaussian bottleneck.
+        codebook_init: ``kmeans`` of encodings before the first step, ``uniform`` in +-1/K (VQ-VAE), or ``normal``.
+        codebook_ema: decay of an EMA codebook; null trains the vectors by the codebook loss.
+        restart_threshold: a code used less than this share of 1/K is dead and restarts from the data; 0 never.
+        restart_every: steps between two looks for dead codes.
+        restart_until: share of the training after which no code is moved any more, so that decoding settles.
+        lr: Adam's learning rate.
+        lr_schedule: ``constant`` (the paper) or ``cosine`` decay to zero at ``max_steps``.
+        warmup_steps: steps of linear warm-up.
+
+    Raises:
+        UserError: a setting outside its range; the message names it.
+    """
+
+    def __init__(
+        self,
+        observation_dim: int,
+        action_dim: int,
+        horizon: int = 10,
+        num_skills: int = 16,
+        skill_dim: int = 128,
+        encoder: Literal["transformer", "gru"] = "transformer",
+        decoder: Literal["diffusion", "mlp"] = "diffusion",
+        bottleneck: Literal["vq", "gaussian"] = "vq",
+        hidden_dim: int = 256,
+        encoder_layers: int = 4,
+        encoder_heads: int = 8,
+        decoder_blocks: int = 4,
+        dropout: float = 0.1,
+        diffusion_steps: int = 5,
+        beta_min: float = 0.1,
+        beta_max: float = 10.0,
+        time_dim: int = 16,
+        sampler: Sampler = "ddpm",
+        noise_scale: float = 1.0,
+        clip_actions: bool = True,
+        reconstruction: Literal["sum", "mean"] = "sum",
+        commitment: float = 0.25,
+        kl_weight: float = 0.01,
+        codebook_init: CodebookInit = "kmeans",
+        codebook_ema: float | None = None,
+        restart_threshold: float = 0.1,
+        restart_every: int = 100,
+        restart_until: float = 0.7,
+        lr: float = 5e-5,
+        lr_schedule: Literal["constant", "cosine"] = "constant",
+        warmup_steps: int = 0,
+    ) -> None:
+        super().__init__()
+        self.save_hyperparameters()
+        self._check_settings()
+        discrete = bottleneck == "vq"
+        self.horizon, self.num_skills, self.discrete = horizon, num_skills, discrete
+        self.normaliser = Normaliser(observation_dim)
+        self.action_box = ActionBox(action_dim)
+        self.encoder = ENCODERS[encoder](
+            observation_dim + action_dim,
+            skill_dim if discrete else 2 * skill_dim,
+            horizon,
+            hidden_dim,
+            encoder_layers,
+            encoder_heads,
+            dropout,
+        )
+        self.bottleneck = (
+            Codebook(num_skills, skill_dim, codebook_init, codebook_ema) if discrete else GaussianBottleneck()
+        )
+        backbone = (observation_dim, action_dim, skill_dim, hidden_dim, decoder_blocks, dropout)
+        self.decoder: DiffusionDecoder | MLPDecoder = (
+            DiffusionDecoder(*backbone, diffusion_steps, beta_min, beta_max, time_dim, sampler, clip_actions)
+            if decoder == "diffusion"
+            else MLPDecoder(*backbone)
+        )
+        self.reconstruction_rmse = MeanMetric()
+        self.usage = CodebookUsage(num_skills)
+
+    def _check_settings(self) -> None:
+        """Refuse settings with which nothing can be learnt."""
+        h = self.hparams
+        rules = [
+            ("num_skills", h.num_skills >= 2, "at least 2: with one code the policy has nothing to choose"),
+            ("horizon", h.horizon >= 1, "at least 1"),
+            ("diffusion_steps", h.diffusion_steps >= 1, "at least 1"),
+            ("encoder_heads", h.hidden_dim % h.encoder_heads == 0, f"a divisor of hidden_dim={h.hidden_dim}"),
+            ("time_dim", h.time_dim % 2 == 0, "an even number: half sines, half cosines"),
+            ("noise_scale", h.noise_scale >= 0, "0 or more"),
+            ("dropout", 0 <= h.dropout < 1, "in [0, 1)"),
+            ("codebook_ema", h.codebook_ema is None or 0 < h.codebook_ema < 1, "null or in (0, 1)"),
+            ("lr", h.lr > 0, "positive"),
+        ]
+        for name, fine, expected in rules:
+            if not fine:
+                raise UserError(f"model.{name} is {h[name]}, expected {expected}")
+
+    # ---------------------------------------------------------------- the method
+
+    def encode_segments(
+        self, observations: Tensor, actions: Tensor, lengths: Tensor | None = None
+    ) -> Quantised | GaussianSkill:
+        """Run encoder and bottleneck.
+
+        Args:
+            observations: (B, H, O) in the environment's units.
+            actions: (B, H, A) likewise.
+            lengths: (B,) steps really taken, for segments cut short by a termination.
+        """
+        sequence = torch.cat([self.normaliser(observations), self.action_box.to_unit(actions)], dim=-1)
+        return self.bottleneck(self.encoder(sequence, lengths))
+
+    def loss(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor], Quantised | GaussianSkill]:
+        """Equation 14: denoising loss plus the terms of the bottleneck.
+
+        Returns:
+            The scalar to minimise, its detached terms by name, and the skills of the batch.
+        """
+        observations, actions = batch["observations"], batch["actions"]  # (B, H, O), (B, H, A)
+        horizon = actions.shape[1]
+        skill = self.encode_segments(observations, actions)
+        error = self.decoder.loss(
+            self.action_box.to_unit(actions).flatten(0, 1),  # (B H, A)
+            self.normaliser(observations).flatten(0, 1),  # (B H, O)
+            skill.vectors.repeat_interleave(horizon, dim=0),  # (B H, D)
+        )
+        denoising = error.mean()
+        if self.hparams.reconstruction == "sum":
+            denoising = denoising * (horizon * actions.shape[-1])
+        if isinstance(skill, Quantised):
+            terms = {"denoising": denoising, "codebook": skill.codebook_loss, "commitment": skill.commitment_loss}
+            total = denoising + skill.codebook_loss + self.hparams.commitment * skill.commitment_loss
+        else:
+            terms = {"denoising": denoising, "kl": skill.kl}
+            total = denoising + self.hparams.kl_weight * skill.kl
+        return total, {name: term.detach() for name, term in terms.items()}, skill
+
+    def encode(self, observations: Tensor, actions: Tensor, lengths: Tensor | None = None) -> Tensor:
+        """Code of each segment, k = argmin ||E(tau) - z_j||: shapes as in `encode_segments`, result (B,) int64."""
+        return self._discrete(self.encode_segments(observations, actions, lengths)).codes
+
+    def decode(
+        self,
+        observations: Tensor,
+        codes: Tensor,
+        noise_scale: float | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Draw actions (B, A) for observations (B, O) under codes (B,)."""
+        if not isinstance(self.bottleneck, Codebook):
+            raise UserError("bottleneck is gaussian: there are no codes to decode, use decode_vectors")
+        return self.decode_vectors(observations, self.bottleneck.lookup(codes), noise_scale, generator)
+
+    def decode_vectors(
+        self,
+        observations: Tensor,
+        vectors: Tensor,
+        noise_scale: float | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Draw actions (B, A), in the environment's units and inside its box, for skill vectors (B, D)."""
+        scale = self.hparams.noise_scale if noise_scale is None else noise_scale
+        return self.action_box.from_unit(
+            self.decoder.sample(self.normaliser(observations), vectors, scale, generator)
+        )
+
+    def _discrete(self, skill: Quantised | GaussianSkill) -> Quantised:
+        if not isinstance(skill, Quantised):
+            raise UserError("bottleneck is gaussian: its skills have no codes; train with bottleneck: vq")
+        return skill
+
+    # ---------------------------------------------------------------- Lightning
+
+    def on_fit_start(self) -> None:
+        """Take the data's statistics and start the codebook, unless a checkpoint brought both."""
+        datamodule = getattr(self.trainer, "datamodule", None)
+        if not bool(self.normaliser.fitted):
+            if datamodule is None or not hasattr(datamodule, "statistics"):
+                raise UserError(
+                    "the skill model has no observation statistics: fit it with a SegmentDataModule, or call "
+                    "normaliser.fit(mean, std) and action_box.fit(low, high) first"
+                )
+            statistics = datamodule.statistics()
+            self.normaliser.fit(statistics["observation_mean"], statistics["observation_std"])
+            self.action_box.fit(statistics["action_low"], statistics["action_high"])
+        if isinstance(self.bottleneck, Codebook) and not bool(self.bottleneck.initted):
+            # A loader of its own: looking at the data must not move the training's place in it.
+            loader = datamodule.train_dataloader() if datamodule else self.trainer.train_dataloader
+            self.bottleneck.start_from(self._encodings(islice(iter(loader), START_BATCHES)))
+
+    @torch.no_grad()
+    def _encodings(self, batches: Any) -> Tensor:
+        """Encoder outputs (N, D) of a few batches, in evaluation mode."""
+        was_training = self.training
+        self.eval()
+        outputs = []
+        for batch in batches:
+            observations = batch["observations"].to(self.device)
+            actions = batch["actions"].to(self.device)
+            outputs.append(
+                self.encoder(torch.cat([self.normaliser(observations), self.action_box.to_unit(actions)], dim=-1))
+            )
+        self.train(was_training)
+        return torch.cat(outputs)
+
+    def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
+        """One optimiser step's loss."""
+        total, terms, skill = self.loss(batch)
+        if self.global_step % self.trainer.log_every_n_steps == 0:
+            log = {"loss": total.detach(), **terms}
+            if isinstance(self.bottleneck, Codebook):
+                share = self.bottleneck.usage
+                log["perplexity"] = (-torch.special.xlogy(share, share).sum()).exp()
+            self.log_dict({f"train/{name}": value for name, value in log.items()})
+        return total
+
+    def on_train_batch_end(self, outputs: Any, batch: dict[str, Tensor], batch_idx: int) -> None:
+        """Restart dead codes from this batch, until the codebook has to settle."""
+        h = self.hparams
+        step = self.global_step
+        if not isinstance(self.bottleneck, Codebook) or h.restart_threshold <= 0 or step % h.restart_every:
+            return
+        if self.trainer.max_steps > 0 and step > h.restart_until * self.trainer.max_steps:
+            return
+        generator = torch.Generator().manual_seed(step)
+        moved = self.bottleneck.restart_dead(self._encodings([batch]), h.restart_threshold, generator)
+        state = self.optimizers().state.get(self.bottleneck.vectors, {})
+        for name in ("exp_avg", "exp_avg_sq"):  # the moments belonged to the code that died
+            if name in state:
+                state[name][moved] = 0.0
+
+    def validation_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
+        """Denoising loss, reconstruction error in action units (by sampling) and codebook usage."""
+        self._evaluate(batch, "val")
+
+    def test_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
+        """As `validation_step`."""
+        self._evaluate(batch, "test")
+
+    def _evaluate(self, batch: dict[str, Tensor], stage: str) -> None:
+        total, terms, skill = self.loss(batch)
+        observations, actions = batch["observations"], batch["actions"]
+        horizon = actions.shape[1]
+        sampled = self.decode_vectors(
+            observations.flatten(0, 1), skill.vectors.repeat_interleave(horizon, dim=0), noise_scale=1.0
+        )
+        self.reconstruction_rmse.update((sampled - actions.flatten(0, 1)).square().mean(dim=-1))
+        log = {"loss": total, **terms}
+        self.log_dict({f"{stage}/{name}": value for name, value in log.items()}, batch_size=len(actions))
+        if isinstance(skill, Quantised):
+            self.usage.update(skill.codes)
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the epoch's reconstruction error and codebook health."""
+        self._log_epoch("val")
+
+    def on_test_epoch_end(self) -> None:
+        """As `on_validation_epoch_end`."""
+        self._log_epoch("test")
+
+    def _log_epoch(self, stage: str) -> None:
+        log = {"reconstruction_rmse": self.reconstruction_rmse.compute().sqrt()}
+        self.reconstruction_rmse.reset()
+        if self.discrete:
+            log.update(self.usage.compute())
+            self.usage.reset()
+        self.log_dict({f"{stage}/{name}": value for name, value in log.items()}, prog_bar=True)
+
+    def predict_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
+        """Codes (B,) of a batch of segments."""
+        return self.encode(batch["observations"], batch["actions"], batch.get("lengths"))
+
+    def configure_optimizers(self) -> Any:
+        """Adam over encoder, codebook and decoder together."""
+        return adam(self.parameters(), self.hparams.lr, self.hparams.lr_schedule, self.hparams.warmup_steps, self)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Load a skill model from a Lightning ``.ckpt`` or a published directory, in evaluation mode on the CPU."""
+        from dds_lightning.checkpointing import load_module
+
+        return load_module(cls, path, part="skill")

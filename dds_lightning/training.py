@@ -1,0 +1,152 @@
+"""What every Trainer of this project has: where it logs, how it saves, how it stops.
+
+The command line and `dds run` both build their Trainer through `trainer_settings`, so that they cannot differ.
+"""
+
+import time
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as pl
+from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, ProgressBar, RichProgressBar
+from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
+
+from dds_lightning import interrupts
+from dds_lightning.callbacks import ExactResume, FiniteGuard
+from dds_lightning.checkpointing import AtomicCheckpointIO
+from dds_lightning.errors import UserError
+
+
+class RollingCheckpoint(Checkpoint):
+    """Keep one file, `last.ckpt`, from which training goes on exactly where it stood.
+
+    It is written after an optimiser step whenever `every_n_steps` steps or `every_n_seconds` seconds have passed, at
+    the end, and when SIGTERM or Ctrl-C asks to stop (then `Interrupted` follows). An error writes nothing: the state
+    that failed must not replace the last good one.
+
+    Args:
+        dirpath: folder of the file; null puts it beside the logs of this launch.
+        every_n_seconds: seconds between two writes; 0 for none by time.
+        every_n_steps: steps between two writes; 0 for none by steps.
+    """
+
+    def __init__(
+        self, dirpath: str | None = None, every_n_seconds: float = 60.0, every_n_steps: int = 0
+    ) -> None:
+        if every_n_seconds < 0 or every_n_steps < 0:
+            raise UserError(
+                f"checkpoint.every_n_seconds is {every_n_seconds} and checkpoint.every_n_steps {every_n_steps}, "
+                "expected 0 or more"
+            )
+        self.dirpath = dirpath
+        self.every_n_seconds = every_n_seconds
+        self.every_n_steps = every_n_steps
+        self.path: Path | None = None
+        self._saved_step = -1
+        self._saved_time = time.monotonic()
+
+    def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
+        """Settle where the file goes."""
+        if stage == "fit":
+            folder = self.dirpath or str(Path(trainer.log_dir or trainer.default_root_dir) / "checkpoints")
+            self.path = Path(trainer.strategy.broadcast(folder)) / "last.ckpt"
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Count the seconds from here: what lies before cannot be lost."""
+        self._saved_time = time.monotonic()
+        self._saved_step = trainer.global_step
+
+    def on_train_batch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Save when it is time, or when somebody asked to stop."""
+        step = trainer.global_step
+        signum = interrupts.pending()
+        by_time = self.every_n_seconds > 0 and time.monotonic() - self._saved_time >= self.every_n_seconds
+        stop = signum is not None
+        if trainer.world_size > 1:
+            # Every process has to take part in a save, and their clocks and signals differ.
+            by_time = trainer.strategy.broadcast(by_time)
+            stop = trainer.strategy.reduce_boolean_decision(stop, all=False)
+        by_steps = self.every_n_steps > 0 and step % self.every_n_steps == 0
+        if stop or ((by_time or by_steps) and step != self._saved_step):
+            self._save(trainer)
+        if stop:
+            raise interrupts.Interrupted(signum or interrupts.SIGNALS[0], str(self.path))
+
+    def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Save the finished model."""
+        if self._saved_step != trainer.global_step or not (self.path and self.path.exists()):
+            self._save(trainer)
+
+    def _save(self, trainer: pl.Trainer) -> None:
+        assert self.path is not None, "setup('fit') comes first"
+        trainer.save_checkpoint(self.path)
+        self._saved_step, self._saved_time = trainer.global_step, time.monotonic()
+
+
+class BestCheckpoint(ModelCheckpoint):
+    """Also keep the checkpoint with the best value of a logged metric, as `best.ckpt`.
+
+    Args:
+        dirpath: folder of the file; null puts it beside the logs of this launch.
+        monitor: name of the metric, e.g. `rollout/success`; null keeps none.
+        mode: `max` or `min`.
+    """
+
+    def __init__(self, dirpath: str | None = None, monitor: str | None = None, mode: str = "max") -> None:
+        super().__init__(
+            dirpath, filename="best", monitor=monitor, mode=mode, save_top_k=1, enable_version_counter=False
+        )
+
+
+def loggers(root: str | Path) -> list[Logger]:
+    """CSV always, TensorBoard when it is installed; each launch gets its own `logs/version_N` under `root`."""
+    csv = CSVLogger(root, name="logs")
+    if not any(find_spec(name) for name in ("tensorboard", "tensorboardX")):
+        return [csv]
+    return [csv, TensorBoardLogger(root, name="logs", version=csv.version)]
+
+
+def trainer_settings(config: dict[str, Any], extra: list[Callback]) -> dict[str, Any]:
+    """Complete a Trainer's settings with this project's parts, as long as the user did not choose others.
+
+    Args:
+        config: keyword arguments of `Trainer`, as a user gave them.
+        extra: callbacks beside those in `config`; checkpoints among them are left out where checkpointing is off.
+
+    Returns:
+        The keyword arguments to build the Trainer with.
+    """
+    config = dict(config)
+    root = config.get("default_root_dir") or "."
+    if config.get("logger") is None or config["logger"] is True:
+        config["logger"] = loggers(root)
+    elif config["logger"] is not False:
+        chosen = config["logger"] if isinstance(config["logger"], list) else [config["logger"]]
+        has_csv = any(isinstance(logger, CSVLogger) for logger in chosen)
+        config["logger"] = chosen if has_csv else [CSVLogger(root, name="logs"), *chosen]
+
+    saves = config.get("enable_checkpointing") is not False and not config.get("fast_dev_run")
+    callbacks = config.get("callbacks") or []
+    callbacks = [
+        *(callbacks if isinstance(callbacks, list) else [callbacks]),
+        *(callback for callback in extra if saves or not isinstance(callback, Checkpoint)),
+    ]
+    callbacks = [c for c in callbacks if not (isinstance(c, BestCheckpoint) and c.monitor is None)]
+    for default in (ExactResume, FiniteGuard):
+        if not any(isinstance(callback, default) for callback in callbacks):
+            callbacks.append(default())
+    if config.get("enable_progress_bar") is not False and not any(
+        isinstance(callback, ProgressBar) for callback in callbacks
+    ):
+        callbacks.append(RichProgressBar(refresh_rate=20))
+    config["callbacks"] = callbacks
+
+    plugins = config.get("plugins") or []
+    plugins = list(plugins) if isinstance(plugins, list) else [plugins]
+    if saves:
+        plugins.append(AtomicCheckpointIO())
+    config["plugins"] = plugins
+    return config
