@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from datamodules.collect.pointmaze import collect_pointmaze as collect_pointmaze
     from datamodules.inspection import check_dataset as check_dataset
     from datamodules.inspection import describe as describe
+    from datamodules.inspection import find_datasets as find_datasets
+    from datamodules.relabel import relabel as relabel
+    from datamodules.relabeled import RelabeledDataModule as RelabeledDataModule
     from datamodules.segments import SegmentDataModule as SegmentDataModule
     from datamodules.segments import TensorLoader as TensorLoader
     from datamodules.sources import load_trajectories as load_trajectories
@@ -22,7 +25,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "DataError": "datamodules.validation",
-    "RelabeledDataModule": "datamodules.relabel",
+    "RelabeledDataModule": "datamodules.relabeled",
     "SegmentDataModule": "datamodules.segments",
     "TensorLoader": "datamodules.segments",
     "Trajectories": "datamodules.trajectories",
@@ -30,6 +33,7 @@ _HOMES = {
     "check_dataset": "datamodules.inspection",
     "collect_pointmaze": "datamodules.collect.pointmaze",
     "describe": "datamodules.inspection",
+    "find_datasets": "datamodules.inspection",
     "load_trajectories": "datamodules.sources",
     "relabel": "datamodules.relabel",
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -15,35 +16,37 @@ from dds_lightning.errors import UserError
 from dds_lightning.tasks import Task, get_task
 
 
-def check_dataset(
-    spec: str, task: Task | str | None = None, *, horizon: int | None = None
-) -> pd.DataFrame:
-    """Read a data set, refuse it if anything is wrong, else describe it.
+def check_dataset(spec: str, task: Task | str | None = None, *, horizon: int | None = None) -> dict[str, Any]:
+    """Read a data set from end to end, refuse it if anything is wrong, else say what is in it.
 
     Args:
         spec: As in `load_trajectories`.
-        task: The task that it must fit, if any; in mazes rewards are those of the task's goal.
-        horizon: H; if given, also count segments and refuse data whose episodes are all shorter.
+        task: The task that it must fit, if any; in mazes rewards are then those of the task's goal.
+        horizon: H; if given, also count segments, and refuse data whose episodes are all shorter.
 
     Returns:
-        As `describe`.
+        The facts of `describe`.
 
     Raises:
         DataError: At the first thing wrong; the message names data set, episode, field and value.
     """
     task = get_task(task) if isinstance(task, str) else task
-    return describe(load_trajectories(spec, task), task=task, horizon=horizon)
+    return describe(load_trajectories(spec, task), task=task, horizon=horizon)[0]
 
 
 def describe(
     trajectories: Trajectories, *, task: Task | None = None, horizon: int | None = None
-) -> pd.DataFrame:
-    """What a person wants to know of a data set: one row a fact, columns `fact` and `value`.
+) -> tuple[dict[str, Any], pd.DataFrame]:
+    """What a person wants to know of a data set.
 
     Args:
         trajectories: The data.
-        task: Adds normalised scores and, in mazes, which share of the free cells was visited.
+        task: Adds normalised scores and, in mazes, how many of the free cells were visited.
         horizon: Adds the number of segments of that many steps.
+
+    Returns:
+        Facts by name, and a table with one row a column of the observations and actions: `dimension`,
+        `lowest`, `mean`, `std`, `highest`.
     """
     lengths, returns = trajectories.lengths, trajectories.returns
     terminated = trajectories.terminations[trajectories.step_offsets[1:] - 1]
@@ -53,24 +56,38 @@ def describe(
         "steps": trajectories.num_steps,
         "observation width": trajectories.observation_dim,
         "action width": trajectories.action_dim,
-        "episode length, shortest": int(lengths.min()),
-        "episode length, median": float(np.median(lengths)),
-        "episode length, longest": int(lengths.max()),
+        "shortest episode": int(lengths.min()),
+        "median episode": float(np.median(lengths)),
+        "longest episode": int(lengths.max()),
         "terminated episodes": int(terminated.sum()),
         "truncated episodes": int((~terminated).sum()),
-        "return, lowest": float(returns.min()),
-        "return, mean": float(returns.mean()),
-        "return, highest": float(returns.max()),
+        "lowest return": round(float(returns.min()), 3),
+        "mean return": round(float(returns.mean()), 3),
+        "highest return": round(float(returns.max()), 3),
     }
     if task is not None:
-        facts["normalised score, mean"] = float(task.normalised_score(returns).mean())
+        facts["mean normalised score"] = round(float(task.normalised_score(returns).mean()), 2)
         if task.maze_map is not None:
             facts["episodes that reach the goal"] = int(terminated.sum())
             facts["free cells visited"] = f"{_visited(trajectories, task)} of {len(task.free_cells())}"
     if horizon is not None:
         facts[f"segments of {horizon} steps"] = len(trajectories.windows(horizon))
     facts["fingerprint"] = trajectories.fingerprint()
-    return pd.DataFrame({"fact": list(facts), "value": pd.Series(list(facts.values()), dtype=object)})
+    columns = {"observation": trajectories.observations, "action": trajectories.actions}
+    dimensions = pd.DataFrame(
+        [
+            {
+                "dimension": f"{kind} {j}",
+                "lowest": float(values[:, j].min()),
+                "mean": float(values[:, j].mean(dtype=np.float64)),
+                "std": float(values[:, j].std(dtype=np.float64)),
+                "highest": float(values[:, j].max()),
+            }
+            for kind, values in columns.items()
+            for j in range(values.shape[1])
+        ]
+    )
+    return facts, dimensions
 
 
 def episode_table(trajectories: Trajectories) -> pd.DataFrame:
@@ -87,35 +104,38 @@ def episode_table(trajectories: Trajectories) -> pd.DataFrame:
     )
 
 
-def list_datasets(root: str | Path | None = None) -> pd.DataFrame:
-    """The Minari data sets under a folder, without reading their arrays.
+def find_datasets(roots: Iterable[str | Path] = ()) -> pd.DataFrame:
+    """The Minari data sets in Minari's own folder and in others, without reading their arrays.
 
     Args:
-        root: Folder of data sets; None takes MINARI_DATASETS_PATH or ~/.minari/datasets.
+        roots: Folders to look in beside MINARI_DATASETS_PATH (or ~/.minari/datasets).
 
     Returns:
-        Columns `data set`, `environment`, `episodes`, `steps`, `data` (the spec to pass on) and `problem`, which is
-        empty for a set whose metadata is sound.
+        One row a data set: `data set`, `environment`, `episodes`, `steps`, `data` (the spec to pass on) and
+        `problem`, which is empty when the metadata are sound.
     """
-    folder = Path(root) if root is not None else minari_root()
-    rows = []
-    for path in sorted(folder.glob("**/data/metadata.json")):
-        home = path.parent.parent
-        if any(part.startswith(".") for part in home.relative_to(folder).parts):
-            continue
-        row: dict[str, Any] = {"data set": home.relative_to(folder).as_posix(), "data": f"local:{home}"}
-        try:
-            metadata = read_metadata(path.parent)
-            row |= {
-                "environment": (metadata["env_spec"] or {}).get("id", "unknown"),
-                "episodes": metadata.get("total_episodes"),
-                "steps": metadata.get("total_steps"),
-                "problem": "",
-            }
-        except UserError as error:
-            row |= {"environment": "", "episodes": None, "steps": None, "problem": str(error)}
-        rows.append(row)
-    return pd.DataFrame(rows, columns=["data set", "environment", "episodes", "steps", "data", "problem"])
+    rows: dict[Path, dict[str, Any]] = {}
+    for root in (minari_root(), *map(Path, roots)):
+        for path in sorted(root.glob("**/data/metadata.json")):
+            home = path.parent.parent
+            inside = home.relative_to(root)
+            if not any(part.startswith(".") for part in inside.parts):  # hidden: half-written by somebody
+                rows[home.resolve()] = {"data set": inside.as_posix(), **_row(home), "data": f"local:{home}"}
+    columns = ["data set", "environment", "episodes", "steps", "data", "problem"]
+    return pd.DataFrame(list(rows.values()), columns=columns)
+
+
+def _row(home: Path) -> dict[str, Any]:
+    try:
+        metadata = read_metadata(home / "data")
+    except UserError as error:
+        return {"environment": "", "episodes": 0, "steps": 0, "problem": str(error)}
+    return {
+        "environment": (metadata["env_spec"] or {}).get("id", ""),
+        "episodes": metadata.get("total_episodes", 0),
+        "steps": metadata.get("total_steps", 0),
+        "problem": "",
+    }
 
 
 def _visited(trajectories: Trajectories, task: Task) -> int:

@@ -52,6 +52,8 @@ class Relabelled:
     """(M,) float, 1 where the segment ends in a termination."""
     starts: Tensor
     """(M,) int64 step of the data set at which the segment begins."""
+    episodes: Tensor
+    """(M,) int64 episode of the segment."""
     num_skills: int
     """K."""
 
@@ -103,7 +105,7 @@ class Relabelled:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
         metadata = {"format": str(FORMAT), "num_skills": str(self.num_skills), "key": json.dumps(key, sort_keys=True)}
-        names = ("observations", "codes", "rewards", "next_observations", "discounts", "dones", "starts")
+        names = ("observations", "codes", "rewards", "next_observations", "discounts", "dones", "starts", "episodes")
         try:
             save_file({name: getattr(self, name).contiguous().cpu() for name in names}, temporary, metadata=metadata)
             with temporary.open("rb") as file:
@@ -242,6 +244,7 @@ def relabel(
         discounts=torch.as_tensor(factor, dtype=torch.float32),
         dones=torch.as_tensor(trajectories.terminations[ends].astype(np.float32)),
         starts=torch.as_tensor(starts),
+        episodes=torch.as_tensor(windows.episodes),
         num_skills=skill.num_skills,
     )
 

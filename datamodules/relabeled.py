@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from datamodules.relabel import Discount, Relabelled, relabel, relabel_key
-from datamodules.segments import TensorLoader
+from datamodules.segments import TensorLoader, split_episodes
 from datamodules.sources import load_trajectories
 from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError
@@ -130,10 +130,10 @@ class RelabeledDataModule(pl.LightningDataModule):
         key = relabel_key(self.trajectories, self.skill, **self.settings)
         path = Path(self.hparams.relabelled) if self.hparams.relabelled else self.cache_file()
         self.transitions = Relabelled.load(path, key)
-        train, validation = self.trajectories.split(self.hparams.validation_fraction, self.hparams.seed)
-        episode = torch.as_tensor(self.trajectories.episode_of(self.transitions.starts.numpy()))
-        self.train_index = torch.nonzero(torch.isin(episode, torch.as_tensor(train))).flatten()
-        self.validation_index = torch.nonzero(torch.isin(episode, torch.as_tensor(validation))).flatten()
+        h = self.hparams
+        _, held_out = split_episodes(self.trajectories, h.validation_fraction, h.seed, self.skill.horizon)
+        kept = torch.isin(self.transitions.episodes, torch.as_tensor(held_out))
+        self.train_index, self.validation_index = torch.nonzero(~kept).flatten(), torch.nonzero(kept).flatten()
 
     def statistics(self) -> dict[str, Any]:
         """What the policy keeps of the data: normalisation, code shares, range of rewards, greatest discount."""
@@ -157,7 +157,7 @@ class RelabeledDataModule(pl.LightningDataModule):
             return transitions.batch(index[rows])
 
         h = self.hparams
-        return TensorLoader(gather, len(index), h.batch_size, shuffle=shuffle, seed=h.seed)
+        return TensorLoader(gather, len(index), h.batch_size, shuffle=shuffle, seed=h.seed, drop_last=shuffle)
 
     def train_dataloader(self) -> TensorLoader:
         """Shuffled batches; the order is a function of seed and epoch."""

@@ -6,29 +6,31 @@ import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import lightning.pytorch as L
+import lightning.pytorch as pl
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from datamodules.sources import load_trajectories
-from datamodules.trajectories import DataError, Trajectories, Windows
+from datamodules.trajectories import Trajectories, Windows
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import get_task
 
 Batch = dict[str, Tensor]
 
 STD_FLOOR = 1e-3
-"""Standard deviations are at least this, so that an observation that never changes does not divide by zero."""
+"""Standard deviations are at least this, so that an observation that never changes does not divide by
+zero."""
 
 
 class TensorLoader:
     """Batches by index, in an order that is a function of (seed, epoch).
 
     A new iteration is a new epoch, whether or not the last one was finished. After `load_state_dict` the next
-    iteration goes on after the last batch that was handed out, or starts the next epoch if that was the last one.
-    Lightning saves and restores this state by itself. There are no workers: indexing is cheaper than a message.
+    iteration goes on after the last batch that was handed out, or starts the next epoch if that was the last
+    one. Lightning saves and restores this state by itself. There are no workers: indexing is cheaper than a
+    message.
     """
 
     def __init__(
@@ -58,7 +60,9 @@ class TensorLoader:
             device: Where the indices go.
         """
         if size < world_size:
-            raise UserError(f"data: found {size} items for {world_size} processes, expected at least one each")
+            raise UserError(
+                f"data: found {size} items for {world_size} processes, expected at least one each"
+            )
         if batch_size < 1:
             raise UserError(f"batch_size: found {batch_size}, expected at least 1")
         self.gather, self.size, self.shuffle, self.seed = gather, size, shuffle, seed
@@ -83,9 +87,9 @@ class TensorLoader:
 
     def __iter__(self) -> Iterator[Batch]:
         """Batches of the next epoch, or the rest of the one that was restored."""
-        # All of this runs at the first `next`, and nothing after the last `yield` matters: Lightning makes iterators
-        # that it never starts, and does not exhaust those that it does.
-        if not (self._resuming and 0 <= self._epoch and self._batch < len(self)):
+        # All of this runs at the first `next`, and nothing after the last `yield` matters: Lightning makes
+        # iterators that it never starts, and does not exhaust those that it does.
+        if not (self._resuming and self._epoch >= 0 and self._batch < len(self)):
             self._epoch, self._batch = self._epoch + 1, 0
         self._resuming = False
         order = self.order(self._epoch)[self.rank :: self.world_size][: self._share].to(self.device)
@@ -107,8 +111,8 @@ class TensorLoader:
         for key, own in self._identity().items():
             if state.get(key) != own:
                 raise UserError(
-                    f"data: the checkpoint was made with {key} = {state.get(key)}, now it is {own}; resume with the "
-                    "same data and batch size"
+                    f"data: the checkpoint was made with {key} = {state.get(key)}, now it is {own}; resume "
+                    "with the same data and batch size"
                 )
         self._epoch, self._batch, self._resuming = state["epoch"], state["batch"], True
 
@@ -118,46 +122,14 @@ class TensorLoader:
         }  # fmt: skip
 
 
-def split_episodes(
-    trajectories: Trajectories, fraction: float, seed: int, horizon: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Episodes for training and for validation, none in both.
-
-    Episodes are drawn at random until they hold `fraction` of all steps. Those shorter than `horizon` stay with
-    training, where they are left out anyway.
-
-    Returns:
-        Sorted episode numbers for training and for validation.
-
-    Raises:
-        DataError: When a part would be empty.
-    """
-    if not 0.0 <= fraction < 1.0:
-        raise UserError(f"validation_fraction: found {fraction}, expected at least 0 and less than 1")
-    everything = np.arange(trajectories.num_episodes)
-    if fraction == 0:
-        return everything, everything[:0]
-    usable = everything[trajectories.lengths >= horizon]
-    if len(usable) == 1:
-        raise DataError(
-            f"data set '{trajectories.name}': only one episode has {horizon} steps, so none can be put aside for "
-            "validation; use more data, or validation_fraction 0"
-        )
-    shuffled = np.random.default_rng([seed, 1]).permutation(usable)
-    before = np.cumsum(trajectories.lengths[shuffled]) - trajectories.lengths[shuffled]
-    count = int(np.sum(before < fraction * trajectories.num_steps))
-    validation = np.sort(shuffled[: min(max(count, 1), len(usable) - 1)])
-    return np.setdiff1d(everything, validation), validation
-
-
-class SegmentDataModule(L.LightningDataModule):
+class SegmentDataModule(pl.LightningDataModule):
     """Sliding windows over offline episodes, as batches `{"observations": (B, H, O), "actions": (B, H, A)}`.
 
-    Units are raw; the model normalises with `statistics()`. Windows never cross an episode. Training and validation
-    have no episode in common.
+    Units are raw; the model normalises with `statistics()`. Windows never cross an episode. Training and
+    validation have no episode in common.
 
-    From your own arrays: `SegmentDataModule.from_trajectories(Trajectories.from_episodes("mine", episodes))`; the
-    form of `episodes` is in the docstring of `datamodules.trajectories`.
+    From your own arrays: `SegmentDataModule.from_trajectories(Trajectories.from_episodes("mine", episodes))`;
+    the form of `episodes` is in the docstring of `datamodules.trajectories`.
 
     Attributes:
         trajectories: All data, after `setup`.
@@ -260,8 +232,8 @@ class SegmentDataModule(L.LightningDataModule):
             return
         data = self._loaded()
         self._windows = data.windows(self.horizon, self.stride)
-        self.training_episodes, self.validation_episodes = split_episodes(
-            data, self.validation_fraction, self.seed, self.horizon
+        self.training_episodes, self.validation_episodes = data.split(
+            self.validation_fraction, self.seed, self.horizon
         )
         held_out = np.isin(self._windows.episodes, self.validation_episodes)
         self.training_segments = np.flatnonzero(~held_out)
@@ -304,10 +276,10 @@ class SegmentDataModule(L.LightningDataModule):
 
     def _how_to_get_data(self) -> str:
         if self.task is None:
-            return "data: neither a task nor data were given; pass for example data='local:DIR' or a task with its data"
+            return "data: neither a task nor data were given; give at least data, for example local:DIR"
         collected = f"`dds data collect {self.task.name} --out data`"
         place = f"local:data/{self.task.data_ids.get('minari', self.task.name)}"
-        return f"data: none was given for task '{self.task.name}'; collect some with {collected} and pass {place}"
+        return f"data: none was given for task '{self.task.name}'; {collected} makes some, then give {place}"
 
     def _loader(self, segments: NDArray[np.int64], **options: Any) -> TensorLoader:
         assert self._windows is not None

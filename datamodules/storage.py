@@ -10,21 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from datamodules.trajectories import Trajectories
+from datamodules.trajectories import ARRAY_TYPES, Trajectories
 from datamodules.validation import DataError
 from dds_lightning.errors import UserError
 
 FORMAT = 1
-_DTYPES = {
-    "observations": np.float32,
-    "actions": np.float32,
-    "rewards": np.float32,
-    "terminations": np.bool_,
-    "truncations": np.bool_,
-    "lengths": np.int64,
-    "action_low": np.float32,
-    "action_high": np.float32,
-}
 
 
 def save_trajectories(trajectories: Trajectories, directory: str | Path, *, overwrite: bool = False) -> Path:
@@ -75,31 +65,41 @@ def read_trajectories(directory: str | Path, *, mmap: bool = False, verify: bool
     if version != FORMAT:
         raise DataError(f"data set '{name}': its format is {version}, expected {FORMAT}; write it again")
     arrays = {}
-    for key, dtype in _DTYPES.items():
+    for key, dtype in ARRAY_TYPES.items():
         path = folder / f"{key}.npy"
         try:
             arrays[key] = np.load(path, mmap_mode="r" if mmap else None, allow_pickle=False)
         except (OSError, ValueError, EOFError) as error:
-            raise DataError(f"data set '{name}': {path} is missing, truncated or damaged ({error})") from error
+            raise DataError(
+                f"data set '{name}': {path} is missing, truncated or damaged ({error})"
+            ) from error
         if arrays[key].dtype != dtype:
-            raise DataError(f"data set '{name}', {key}: found type {arrays[key].dtype}, expected {np.dtype(dtype)}")
+            raise DataError(
+                f"data set '{name}', {key}: found type {arrays[key].dtype}, expected {np.dtype(dtype)}"
+            )
     steps, episodes = len(arrays["rewards"]), len(arrays["lengths"])
     rows = {"actions": steps, "terminations": steps, "truncations": steps, "observations": steps + episodes}
     for key, expected in rows.items():
         if len(arrays[key]) != expected:
             raise DataError(f"data set '{name}', {key}: found {len(arrays[key])} rows, expected {expected}")
     if arrays["lengths"].sum() != steps:
-        raise DataError(f"data set '{name}', lengths: they add up to {arrays['lengths'].sum()}, expected {steps}")
+        raise DataError(
+            f"data set '{name}', lengths: they add up to {arrays['lengths'].sum()}, expected {steps}"
+        )
     trajectories = Trajectories(name=name, **arrays)
     if verify and trajectories.fingerprint() != fingerprint:
-        raise DataError(f"data set '{name}': the arrays in {folder} do not match their fingerprint; they were changed")
+        raise DataError(
+            f"data set '{name}': the arrays in {folder} do not match their fingerprint; they were changed"
+        )
     return trajectories
 
 
 def refuse_existing(folder: Path, overwrite: bool) -> None:
     """Raise UserError when `folder` exists and may not be replaced."""
     if folder.exists() and not overwrite:
-        raise UserError(f"out: {folder} exists already; choose another place, or ask for it to be overwritten")
+        raise UserError(
+            f"out: {folder} exists already; choose another place, or ask for it to be overwritten"
+        )
 
 
 def write_durably(path: Path, text: str) -> None:

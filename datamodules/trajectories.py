@@ -25,7 +25,6 @@ Your own arrays come in by `Trajectories.from_episodes`:
 from __future__ import annotations
 
 import hashlib
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -36,29 +35,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from datamodules.validation import DataError, validate_episode
+from datamodules.windows import Windows, ranges, sliding_windows
 
 __all__ = ["DataError", "Trajectories", "Windows"]
 
-
-@dataclass(frozen=True, eq=False)
-class Windows:
-    """Segments of up to H steps, each inside one episode.
-
-    Attributes:
-        starts: (M,) int64, first step.
-        observation_starts: (M,) int64, row of the first observation.
-        lengths: (M,) int64, steps h: H, or fewer where a termination cuts the segment short.
-        episodes: (M,) int64.
-    """
-
-    starts: NDArray[np.int64]
-    observation_starts: NDArray[np.int64]
-    lengths: NDArray[np.int64]
-    episodes: NDArray[np.int64]
-
-    def __len__(self) -> int:
-        """Number of segments M."""
-        return len(self.starts)
+ARRAY_TYPES = {
+    "observations": np.float32,
+    "actions": np.float32,
+    "rewards": np.float32,
+    "terminations": np.bool_,
+    "truncations": np.bool_,
+    "lengths": np.int64,
+    "action_low": np.float32,
+    "action_high": np.float32,
+}
+"""Every array of a `Trajectories` and its type."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,8 +106,8 @@ class Trajectories:
             episode_names: What messages call the episodes; None counts from "episode 0".
 
         Raises:
-            DataError: When there is no episode, or one is not as it must be; the message names the data set, the
-                episode, the field and the value.
+            DataError: When there is no episode, or one is not as it must be; the message names the data set,
+                the episode, the field and the value.
         """
         if not len(episodes):
             raise DataError(f"data set '{name}' is empty: it has no episodes")
@@ -146,8 +137,8 @@ class Trajectories:
                 f"data set '{self.name}': episode {ids.min() if ids.min() < 0 else ids.max()} was asked for, "
                 f"expected 0 to {self.num_episodes - 1}"
             )
-        steps = _ranges(self.step_offsets[ids], self.lengths[ids])
-        rows = _ranges(self.observation_offsets[ids], self.lengths[ids] + 1)
+        steps = ranges(self.step_offsets[ids], self.lengths[ids])
+        rows = ranges(self.observation_offsets[ids], self.lengths[ids] + 1)
         return replace(
             self,
             observations=self.observations[rows],
@@ -225,63 +216,58 @@ class Trajectories:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Every array by name."""
-        return {key: value for key, value in vars(self).items() if isinstance(value, np.ndarray) and key in _ARRAYS}
+        return {key: getattr(self, key) for key in ARRAY_TYPES}
+
+    def episode_of(self, steps: ArrayLike) -> NDArray[np.int64]:
+        """The episode of each step, same shape as `steps`."""
+        return np.searchsorted(self.step_offsets, np.asarray(steps), side="right") - 1
+
+    def split(
+        self, fraction: float, seed: int, horizon: int = 1
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Episodes for training and for validation, none in both.
+
+        Episodes are drawn at random until they hold `fraction` of all steps. Those shorter than `horizon`
+        stay with training, where they are left out anyway.
+
+        Args:
+            fraction: Share of the steps that is put aside; 0 puts nothing aside.
+            seed: Same seed, same split.
+            horizon: Steps that an episode must have to be of use.
+
+        Returns:
+            Sorted episode numbers for training and for validation.
+
+        Raises:
+            DataError: When there is only one episode to divide, or `fraction` is out of range.
+        """
+        if not 0.0 <= fraction < 1.0:
+            raise DataError(f"validation_fraction: found {fraction}, expected at least 0 and less than 1")
+        everything = np.arange(self.num_episodes)
+        if fraction == 0:
+            return everything, everything[:0]
+        shuffled = np.random.default_rng([seed, 1]).permutation(everything)
+        usable = shuffled[self.lengths[shuffled] >= horizon]
+        if len(usable) < 2:
+            raise DataError(
+                f"data set '{self.name}': {len(usable)} of its episodes have {horizon} steps, so none can be "
+                "put aside for validation; use more data, or validation_fraction 0"
+            )
+        before = np.cumsum(self.lengths[usable]) - self.lengths[usable]
+        count = int(np.sum(before < fraction * self.num_steps))
+        validation = np.sort(usable[: min(max(count, 1), len(usable) - 1)])
+        return np.setdiff1d(everything, validation), validation
 
     # ------------------------------------------------------------------ segments
 
     def windows(self, horizon: int, stride: int = 1, tail: Literal["full", "terminated"] = "full") -> Windows:
-        """Sliding windows that never cross an episode.
-
-        Args:
-            horizon: H, steps of a window.
-            stride: Steps between the starts of two windows of one episode; H divides episodes into separate parts.
-            tail: "full" takes windows of H steps only. "terminated" also takes the shorter ones that end in a
-                termination: they tell the learner where episodes end. Windows cut by a time-out are never taken,
-                because nothing is known of the steps that they lack.
-
-        Raises:
-            DataError: When no episode is long enough.
-            ValueError: For a horizon, stride or tail out of range.
-        """
-        if horizon < 1 or stride < 1:
-            raise DataError(f"horizon and stride: found {horizon} and {stride}, expected at least 1")
-        if tail not in ("full", "terminated"):
-            raise DataError(f"tail: found '{tail}', expected 'full' or 'terminated'")
-        ended = self.terminations[self.step_offsets[1:] - 1]
-        # Windows may start at 0, stride, 2 * stride, ... up to (not including) this step of the episode.
-        stop = np.maximum(self.lengths - horizon + 1, 0)
-        if tail == "terminated":
-            stop = np.where(ended, self.lengths, stop)
-        counts = -(-stop // stride)
-        self._warn_of_short(horizon, counts == 0)
-        episodes = np.repeat(np.arange(self.num_episodes), counts)
-        local = _ranges(np.zeros_like(counts), counts) * stride
-        starts = self.step_offsets[episodes] + local
-        return Windows(
-            starts=starts,
-            observation_starts=starts + episodes,
-            lengths=np.minimum(horizon, self.lengths[episodes] - local),
-            episodes=episodes,
-        )
-
-    def _warn_of_short(self, horizon: int, dropped: NDArray[np.bool_]) -> None:
-        if not dropped.any():
-            return
-        if dropped.all():
-            raise DataError(
-                f"data set '{self.name}': horizon {horizon} is longer than every one of the {self.num_episodes} "
-                f"episodes (the longest has {self.lengths.max()} steps); choose a smaller horizon"
-            )
-        warnings.warn(
-            f"data set '{self.name}': {int(dropped.sum())} of {self.num_episodes} episodes are shorter than horizon "
-            f"{horizon} and are left out ({int(self.lengths[dropped].sum())} of {self.num_steps} steps)",
-            stacklevel=3,
-        )
+        """Sliding windows of `horizon` steps; see `datamodules.windows.sliding_windows`."""
+        return sliding_windows(self, horizon, stride, tail)
 
     # ------------------------------------------------------------------ on disk
 
     def save(self, directory: str | Path, *, overwrite: bool = False) -> Path:
-        """Write one .npy file an array and `trajectories.json`; whole or not at all. See `datamodules.storage`."""
+        """Write a folder of .npy files, whole or not at all; see `datamodules.storage`."""
         from datamodules.storage import save_trajectories
 
         return save_trajectories(self, directory, overwrite=overwrite)
@@ -294,19 +280,6 @@ class Trajectories:
         return read_trajectories(directory, mmap=mmap, verify=verify)
 
 
-_ARRAYS = (
-    "observations", "actions", "rewards", "terminations", "truncations", "lengths", "action_low", "action_high"
-)  # fmt: skip
-
-
 def _width(value: Any) -> int | None:
     shape = np.shape(value) if value is not None else ()
-    return int(shape[1]) if len(shape) == 2 else None
-
-
-def _ranges(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """`starts[0] .. starts[0] + counts[0] - 1`, then the next, end to end."""
-    ends = np.cumsum(counts)
-    if not len(ends):
-        return np.zeros(0, np.int64)
-    return np.arange(ends[-1]) + np.repeat(starts - (ends - counts), counts)
+    return tuple(shape)[1] if len(shape) == 2 else None

@@ -1,7 +1,8 @@
 """What a data set must be. Every refusal names the data set, the episode, the field and the value.
 
-File formats accept almost anything (not-a-number, one observation too few, episodes without an end), and a learner
-trained on such data fails late and silently. So everything that enters a `Trajectories` passes through here.
+File formats accept almost anything (not-a-number, one observation too few, episodes without an end), and a
+learner trained on such data fails late and silently. So everything that enters a `Trajectories` passes
+through here.
 """
 
 from __future__ import annotations
@@ -79,7 +80,9 @@ def _array(where: str, name: str, value: Any) -> NDArray[Any]:
     return array
 
 
-def _check_shapes(where: str, arrays: dict[str, NDArray[Any]], observations: int | None, actions: int) -> None:
+def _check_shapes(
+    where: str, arrays: dict[str, NDArray[Any]], observations: int | None, actions: int
+) -> None:
     steps = len(arrays["rewards"]) if arrays["rewards"].ndim else 0
     for name, width in (("observations", observations), ("actions", actions)):
         shape = arrays[name].shape
@@ -119,7 +122,8 @@ def _in_box(
     if len(outside):
         t, j = (int(i) for i in outside[0])
         raise DataError(
-            f"{where}, actions: found {actions[t, j]:g} at step {t}, column {j}, expected {low[j]:g} to {high[j]:g}"
+            f"{where}, actions: found {actions[t, j]:g} at step {t}, column {j}, expected {low[j]:g} to "
+            f"{high[j]:g}"
         )
     return np.clip(actions, low, high)
 
@@ -129,8 +133,8 @@ def _check_ends(where: str, arrays: dict[str, NDArray[Any]]) -> None:
         early = np.flatnonzero(arrays[name][:-1])
         if len(early):
             raise DataError(
-                f"{where}, {name}: found True at step {early[0]}, inside an episode of {len(arrays[name])} steps; "
-                "expected it on the last step only"
+                f"{where}, {name}: found True at step {early[0]}, inside an episode of {len(arrays[name])} "
+                "steps; expected it on the last step only"
             )
     if not (arrays["terminations"][-1] or arrays["truncations"][-1]):
         raise DataError(

@@ -1,7 +1,8 @@
 """Ctrl-C and SIGTERM: stop at a place from which the work can go on, and say so with the exit status.
 
-Outside a training the first signal raises `Interrupted` at once. Inside `deferred()` it only sets a mark, which the
-checkpoint callback sees after the next optimiser step: it saves and raises there. A second signal never waits.
+Outside a training the first signal raises `Interrupted` at once. Inside `deferred()` it only sets a mark,
+which the checkpoint callback sees after the next optimiser step: it saves and raises there. A second signal
+never waits.
 """
 
 import signal
@@ -14,7 +15,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupted(SystemExit):
-    """The user or the scheduler asked to stop; the exit status is 128 + the signal's number, as shells expect.
+    """The user or the scheduler asked to stop; the exit status is 128 + the signal, as shells expect.
 
     Args:
         signum: the signal.
@@ -61,7 +62,7 @@ def caught() -> Iterator[None]:
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Let the first signal wait for `pending()` to be asked; one that nobody asked about raises at the end."""
+    """Let the first signal wait until `pending()` is asked; one that nobody asked about raises at the end."""
     _Mark.deferring, _Mark.signum = True, None
     try:
         yield

@@ -224,7 +224,12 @@ class PolicyModule(pl.LightningModule):
         with torch.set_grad_enabled(self.learns_critic and torch.is_grad_enabled()):
             v = self.value(features).squeeze(-1)  # (B,)
         total = features.new_zeros(())
-        info: dict[str, Tensor] = {"v_mean": v.mean(), "v_min": v.min(), "v_max": v.max(), "q_mean": target_q.mean()}
+        info: dict[str, Tensor] = {
+            "v_mean": v.mean(),
+            "v_min": v.min(),
+            "v_max": v.max(),
+            "q_mean": target_q.mean(),
+        }
         if self.learns_critic:
             critic_loss, terms = self.critic_loss(features, v, target_q, batch)
             total = total + critic_loss
@@ -328,7 +333,9 @@ class PolicyModule(pl.LightningModule):
 
     def configure_optimizers(self) -> Any:
         """Adam over value, critic and policy together; a part that does not learn has no gradient and stays."""
-        return adam(self.parameters(), self.hparams.lr, self.hparams.lr_schedule, self.hparams.warmup_steps, self)
+        return adam(
+            self.parameters(), self.hparams.lr, self.hparams.lr_schedule, self.hparams.warmup_steps, self
+        )
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

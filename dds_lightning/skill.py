@@ -187,7 +187,11 @@ class SkillModule(pl.LightningModule):
         if self.hparams.reconstruction == "sum":
             denoising = denoising * (horizon * actions.shape[-1])
         if isinstance(skill, Quantised):
-            terms = {"denoising": denoising, "codebook": skill.codebook_loss, "commitment": skill.commitment_loss}
+            terms = {
+                "denoising": denoising,
+                "codebook": skill.codebook_loss,
+                "commitment": skill.commitment_loss,
+            }
             total = denoising + skill.codebook_loss + self.hparams.commitment * skill.commitment_loss
         else:
             terms = {"denoising": denoising, "kl": skill.kl}
@@ -257,7 +261,9 @@ class SkillModule(pl.LightningModule):
             observations = batch["observations"].to(self.device)
             actions = batch["actions"].to(self.device)
             outputs.append(
-                self.encoder(torch.cat([self.normaliser(observations), self.action_box.to_unit(actions)], dim=-1))
+                self.encoder(
+                    torch.cat([self.normaliser(observations), self.action_box.to_unit(actions)], dim=-1)
+                )
             )
         self.train(was_training)
         return torch.cat(outputs)
@@ -331,7 +337,9 @@ class SkillModule(pl.LightningModule):
 
     def configure_optimizers(self) -> Any:
         """Adam over encoder, codebook and decoder together."""
-        return adam(self.parameters(), self.hparams.lr, self.hparams.lr_schedule, self.hparams.warmup_steps, self)
+        return adam(
+            self.parameters(), self.hparams.lr, self.hparams.lr_schedule, self.hparams.warmup_steps, self
+        )
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

@@ -1,24 +1,19 @@
 """The table of tasks: which environment, from where to where, how long, and how scores and rewards are read.
 
 A task is one environment with one start and one goal. Facts are rows of `_ROWS`; a new task is a new row.
-Environments are built here and nowhere else, never from what a data set says about itself.
+Environments are built from this table and nothing else, never from what a data set says about itself.
 """
 
 from __future__ import annotations
 
-import contextlib
 import difflib
-import io
 import math
-import tempfile
-import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 from numpy.typing import ArrayLike, NDArray
 
 from dds_lightning.errors import UserError
@@ -27,8 +22,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Cell = tuple[int, int]
-
-_BUILD_LOCK = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -55,7 +48,8 @@ class Task:
         score_max: Return that scores 100.
         evaluation_episodes: Episodes behind a published score.
         data_ids: Source -> name of the data set in that source.
-        data_env_ids: Environments whose recordings fit this task (same body, same walls); `env_id` always does.
+        data_env_ids: Environments whose recordings fit this task (same body, same walls); `env_id` always
+            does.
         data_start_cells: Cells where collected episodes start; None means every free cell.
         data_goal_cells: Cells that collected episodes head for; None means every free cell.
         paper_score: Normalised score that the paper reports, if it does.
@@ -151,87 +145,19 @@ class Task:
     def make_env(self, render_mode: str | None = None) -> gym.Env[NDArray[np.float32], NDArray[np.float32]]:
         """The evaluation environment: flat float32 observations, this task's start and goal at every reset.
 
-        In mazes the body starts in `start_cell` with the environment's own noise, the goal is exactly the centre of
-        `goal_cell`, and reaching it ends the episode. `info` holds `success` (bool) after every reset and step, and
-        in mazes `position` (2,).
+        In mazes the body starts in `start_cell` with the environment's own noise, the goal is exactly the
+        centre of `goal_cell`, and reaching it ends the episode. `info` holds `success` (bool) after every
+        reset and step, and in mazes `position` (2,).
 
         Args:
             render_mode: Gymnasium's render mode, for example "rgb_array".
         """
         options = {"continuing_task": False} if self.maze_map is not None else {}
-        env = build_env(self.env_id, max_episode_steps=self.max_episode_steps, render_mode=render_mode, **options)
+        from dds_lightning.environments import TaskEnv, build_env
+
+        cap = self.max_episode_steps
+        env = build_env(self.env_id, max_episode_steps=cap, render_mode=render_mode, **options)
         return TaskEnv(env, self)
-
-
-class TaskEnv(gym.Wrapper[NDArray[np.float32], NDArray[np.float32], Any, Any]):
-    """Flattens observations and pins start and goal; see `Task.make_env`."""
-
-    def __init__(self, env: gym.Env[Any, Any], task: Task) -> None:
-        """Wrap `env`, which must come from `build_env`."""
-        super().__init__(env)
-        self.task = task
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (task.observation_dim,), np.float32)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start an episode; `options` may override `reset_cell` and `goal_cell`."""
-        if self.task.maze_map is None:
-            observation, info = self.env.reset(seed=seed, options=options)
-            return self._outside(observation, info)
-        cells = {"reset_cell": self.task.start_cell, "goal_cell": self.task.goal_cell, **(options or {})}
-        observation, info = self.env.reset(seed=seed, options=cells)
-        maze: Any = self.env.unwrapped
-        # The environment moves the goal by up to a quarter of a cell; one task has one goal, so put it back.
-        maze.goal = self.task.cell_to_xy(cells["goal_cell"])
-        maze.update_target_site_pos()
-        away = float(np.linalg.norm(observation["achieved_goal"] - maze.goal))
-        info["success"] = away <= self.task.goal_radius
-        return self._outside(observation, info)
-
-    def step(
-        self, action: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """One step of the environment."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        flat, info = self._outside(observation, info)
-        return flat, float(reward), bool(terminated), bool(truncated), info
-
-    def _outside(self, observation: Any, info: dict[str, Any]) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        info["success"] = bool(info.get("success", False))
-        if self.task.maze_map is not None:
-            info["position"] = np.array(observation["achieved_goal"], dtype=np.float64)
-            observation = observation["observation"]
-        return np.asarray(observation, dtype=np.float32), info
-
-
-def register_environments() -> None:
-    """Make gymnasium-robotics' environments known to Gymnasium; slow the first time, so done when needed only."""
-    with _BUILD_LOCK, contextlib.redirect_stderr(io.StringIO()):  # it prints a notice about other environments
-        import gymnasium_robotics
-
-        gym.register_envs(gymnasium_robotics)
-
-
-def build_env(env_id: str | EnvSpec, **kwargs: Any) -> gym.Env[Any, Any]:
-    """`gymnasium.make` for any of our environments, safe to call from many processes at once.
-
-    A maze writes its MuJoCo XML into the temporary directory under the time of day and never deletes it. Two
-    processes can meet on one name, and every environment leaves a file behind. Here each environment gets a
-    temporary directory of its own, which goes as soon as MuJoCo has read the file.
-
-    Args:
-        env_id: Gymnasium's name of the environment, or a specification of our own making.
-        **kwargs: Passed on to `gymnasium.make`; None values are left out.
-    """
-    register_environments()
-    kwargs = {key: value for key, value in kwargs.items() if value is not None}
-    with _BUILD_LOCK, tempfile.TemporaryDirectory(prefix="dds-env-") as own:
-        before, tempfile.tempdir = tempfile.tempdir, own
-        try:
-            return gym.make(env_id, disable_env_checker=True, **kwargs)
-        finally:
-            tempfile.tempdir = before
 
 
 # ---------------------------------------------------------------------- the table
@@ -256,8 +182,8 @@ def _pointmaze(
 ) -> tuple[Task, ...]:
     """Both data recipes of one PointMaze; `play` are the hand-picked cells between which `-play` data travel.
 
-    Rewards are learnt as 0.1 * (r - 1): every step on the way costs the same, as IQL does for AntMaze, and a skill
-    of ten steps costs about one.
+    Rewards are learnt as 0.1 * (r - 1): every step on the way costs the same, as IQL does for AntMaze, and a
+    skill of ten steps costs about one.
     """
     camel = "UMaze" if size == "umaze" else size.capitalize()
     kinds = ("", "_Diverse_G", "_Diverse_GR", "Dense", "_Diverse_GDense", "_Diverse_GRDense")
@@ -322,7 +248,7 @@ def get_task(name: str) -> Task:
     if name in _TABLE:
         return _TABLE[name]
     near = difflib.get_close_matches(str(name), _TABLE, n=3, cutoff=0.5) or list(_TABLE)
-    raise UserError(f"task: there is no task '{name}'; did you mean {', '.join(near)}? `dds tasks` lists them all")
+    raise UserError(f"task: there is no task '{name}'; did you mean {', '.join(near)}? See `dds tasks`")
 
 
 def known_env_ids() -> frozenset[str]:

@@ -1,6 +1,7 @@
 """What every Trainer of this project has: where it logs, how it saves, how it stops.
 
-The command line and `dds run` both build their Trainer through `trainer_settings`, so that they cannot differ.
+The command line and `dds run` both build their Trainer through `trainer_settings`, so that they cannot
+differ.
 """
 
 import time
@@ -21,9 +22,9 @@ from dds_lightning.errors import UserError
 class RollingCheckpoint(Checkpoint):
     """Keep one file, `last.ckpt`, from which training goes on exactly where it stood.
 
-    It is written after an optimiser step whenever `every_n_steps` steps or `every_n_seconds` seconds have passed, at
-    the end, and when SIGTERM or Ctrl-C asks to stop (then `Interrupted` follows). An error writes nothing: the state
-    that failed must not replace the last good one.
+    It is written after an optimiser step whenever `every_n_steps` steps or `every_n_seconds` seconds have
+    passed, at the end, and when SIGTERM or Ctrl-C asks to stop (then `Interrupted` follows). An error writes
+    nothing: the state that failed must not replace the last good one.
 
     Args:
         dirpath: folder of the file; null puts it beside the logs of this launch.
@@ -35,9 +36,9 @@ class RollingCheckpoint(Checkpoint):
         self, dirpath: str | None = None, every_n_seconds: float = 60.0, every_n_steps: int = 0
     ) -> None:
         if every_n_seconds < 0 or every_n_steps < 0:
+            found = f"{every_n_seconds} and {every_n_steps}"
             raise UserError(
-                f"checkpoint.every_n_seconds is {every_n_seconds} and checkpoint.every_n_steps {every_n_steps}, "
-                "expected 0 or more"
+                f"checkpoint.every_n_seconds and checkpoint.every_n_steps are {found}, expected 0 or more"
             )
         self.dirpath = dirpath
         self.every_n_seconds = every_n_seconds
@@ -102,7 +103,7 @@ class BestCheckpoint(ModelCheckpoint):
 
 
 def loggers(root: str | Path) -> list[Logger]:
-    """CSV always, TensorBoard when it is installed; each launch gets its own `logs/version_N` under `root`."""
+    """CSV always, TensorBoard when installed; each launch gets its own `logs/version_N` under `root`."""
     csv = CSVLogger(root, name="logs")
     if not any(find_spec(name) for name in ("tensorboard", "tensorboardX")):
         return [csv]
@@ -114,7 +115,8 @@ def trainer_settings(config: dict[str, Any], extra: list[Callback]) -> dict[str,
 
     Args:
         config: keyword arguments of `Trainer`, as a user gave them.
-        extra: callbacks beside those in `config`; checkpoints among them are left out where checkpointing is off.
+        extra: callbacks beside those in `config`; checkpoints among them are left out where checkpointing is
+            off.
 
     Returns:
         The keyword arguments to build the Trainer with.

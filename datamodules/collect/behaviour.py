@@ -1,7 +1,8 @@
-"""The behaviour that makes PointMaze data: waypoints from the planner, a velocity controller, and noise on purpose.
+"""The behaviour that makes PointMaze data: planned waypoints, a velocity controller, and noise on purpose.
 
-Coverage decides what can be learnt. A controller that always drives well never shows the learner a wall, a dead end
-or a body at rest, and a value network that has not seen them believes that goals are near as the crow flies.
+Coverage decides what can be learnt. A controller that always drives well never shows the learner a wall, a
+dead end or a body at rest, and a value network that has not seen them believes that goals are near as the
+crow flies.
 """
 
 from __future__ import annotations
@@ -56,8 +57,8 @@ QUIET = BehaviourNoise(waypoint_offset=0.0, action_noise=0.0, burst_probability=
 class Driver:
     """Drives one point mass towards one goal at a time.
 
-    Everything random is drawn once an episode, before the first step; a step is then a few Python floats, which is
-    cheaper than NumPy on two numbers and makes an episode a function of its seed alone.
+    Everything random is drawn once an episode, before the first step; a step is then a few Python floats,
+    which is cheaper than NumPy on two numbers and makes an episode a function of its seed alone.
     """
 
     def __init__(self, task: Task, *, speed: float = 4.5, gain: float = 0.5) -> None:
@@ -78,7 +79,7 @@ class Driver:
         self.start_episode(np.random.default_rng(0), 1, QUIET)
 
     def start_episode(self, rng: np.random.Generator, steps: int, noise: BehaviourNoise) -> None:
-        """Draw an episode's noise: action noise, bursts, waypoint offsets."""
+        """Draw an episode's noise: action noise, bursts, waypoint offsets; after `steps` it repeats."""
         self._noise = (noise.action_noise * rng.standard_normal((steps, 2))).tolist()
         self._burst = _bursts(rng, steps, noise)
         self._offsets = (
@@ -94,7 +95,7 @@ class Driver:
 
     def act(self, x: float, y: float, vx: float, vy: float, goal: tuple[float, float]) -> tuple[float, float]:
         """The force for this step, in the box."""
-        step = self._step
+        step = self._step if self._step < len(self._noise) else 0
         self._step = step + 1
         burst = self._burst[step]
         if burst is not None:
@@ -113,9 +114,7 @@ class Driver:
         return min(max(force_x, -1.0), 1.0), min(max(force_y, -1.0), 1.0)
 
 
-def _bursts(
-    rng: np.random.Generator, steps: int, noise: BehaviourNoise
-) -> list[tuple[float, float] | None]:
+def _bursts(rng: np.random.Generator, steps: int, noise: BehaviourNoise) -> list[tuple[float, float] | None]:
     """Steps of an episode at which a random action replaces the controller's, and that action.
 
     Half of the bursts hold one force (they press the body against walls), half draw a new one at every step.

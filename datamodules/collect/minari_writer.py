@@ -1,4 +1,4 @@
-"""Writes a Minari data set: whole or not at all, the same bytes for the same arrays, every chunk with a checksum."""
+"""Writes a Minari data set: whole or not at all, every chunk with a checksum."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from datamodules.storage import put_in_place, refuse_existing, write_durably
 
 Episode = Mapping[str, Any]
-"""Minari's field names (observations, actions, rewards, terminations, truncations, infos) to arrays or dicts of them."""
+"""Minari's field names (observations, actions, rewards, ..., infos) to arrays or mappings of arrays."""
 
 
 def write_minari(
@@ -36,8 +36,9 @@ def write_minari(
 ) -> Path:
     """Write `root/dataset_id/data/{main_data.hdf5,metadata.json}`, as `minari.load_dataset` expects them.
 
-    Everything is written into a hidden sibling folder which takes its name only when it is complete, so that an
-    interrupted run leaves no data set. Chunks carry HDF5's Fletcher-32 sums: changed bytes are noticed on reading.
+    Everything is written into a hidden sibling folder which takes its name only when it is complete, so that
+    an interrupted run leaves no data set. Chunks carry HDF5's Fletcher-32 sums: changed bytes are noticed on
+    reading.
 
     Args:
         root: Folder of data sets; the value of MINARI_DATASETS_PATH under which Minari finds this one.
@@ -90,7 +91,7 @@ def write_minari(
 def _write_episodes(path: Path, episodes: Iterable[Episode]) -> tuple[int, int]:
     count = steps = 0
     with h5py.File(path, "w", libver="v110") as file:
-        for count, episode in enumerate(episodes, start=1):  # noqa: B007 (the count is used after the loop)
+        for count, episode in enumerate(episodes, start=1):
             group = file.create_group(f"episode_{count - 1}")
             length = len(episode["rewards"])
             group.attrs["id"] = count - 1

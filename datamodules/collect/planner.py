@@ -19,9 +19,9 @@ class MazePlanner:
     Cells are numbered row by row: `index = row * columns + column`.
 
     Attributes:
-        next_cell: (cells, cells) int64; `next_cell[goal, cell]` is the neighbour of `cell` nearest to `goal`, the
-            goal itself at the goal. A wall cell points at the nearest free cell, so that a body whose centre slips
-            over an edge finds back.
+        next_cell: (cells, cells) int64; `next_cell[goal, cell]` is the neighbour of `cell` nearest to `goal`,
+            the goal itself at the goal. A wall cell points at the nearest free cell, so that a body whose
+            centre slips over an edge finds back.
         distance: (cells, cells) int64; steps between cells, -1 where there is no way.
     """
 

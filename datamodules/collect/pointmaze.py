@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from datamodules.collect.behaviour import QUIET, BehaviourNoise, Driver
 from datamodules.collect.minari_writer import write_minari
 from datamodules.storage import refuse_existing
+from dds_lightning.environments import build_env, register_environments
 from dds_lightning.errors import UserError
-from dds_lightning.tasks import Task, build_env, get_task, register_environments
+from dds_lightning.tasks import Task, get_task
 
 _EPISODES_A_PARCEL = 4  # what a worker fetches at once; has no influence on the data
 
@@ -46,9 +47,10 @@ def collect_pointmaze(
 ) -> Path:
     """Collect a PointMaze data set and write it as a Minari data set.
 
-    A shortest path over the maze's cells gives waypoints, a velocity controller drives to them, and a new goal is
-    drawn whenever one is reached. `diverse` tasks start and head anywhere, `play` tasks between hand-picked cells.
-    Each episode is a function of (seed, its number), so the arrays are the same for any number of workers.
+    A shortest path over the maze's cells gives waypoints, a velocity controller drives to them, and a new
+    goal is drawn whenever one is reached. `diverse` tasks start and head anywhere, `play` tasks between
+    hand-picked cells. Each episode is a function of (seed, its number), so the arrays are the same for any
+    number of workers.
 
     Args:
         task: A PointMaze task or its name.
@@ -85,7 +87,9 @@ def collect_pointmaze(
         raise UserError(f"seed: found {seed}, expected at least 0")
     if not 0 < speed <= 5:
         raise UserError(f"speed: found {speed}, expected more than 0 and at most 5 metres a second")
-    noise = BehaviourNoise(waypoint_offset, action_noise, burst_probability, tuple(burst_steps), start_offset)
+    noise = BehaviourNoise(
+        waypoint_offset, action_noise, burst_probability, (burst_steps[0], burst_steps[1]), start_offset
+    )
     name = dataset_id or task.data_ids["minari"]
     refuse_existing(Path(out) / name, overwrite)
 
@@ -113,11 +117,11 @@ def collect_pointmaze(
 
 
 def collection_spec(task: Task, episode_steps: int) -> EnvSpec:
-    """The environment that data are recorded in: goals change when reached, episodes end by the clock only."""
-    starts, goals = set(task.data_start_cells or ()), set(task.data_goal_cells or ())
+    """The environment that data are recorded in: goals change when reached, only the clock ends episodes."""
     options: dict[str, Any] = {"continuing_task": True, "reset_target": True}
-    if starts or goals:
-        options["maze_map"] = _lettered(task, starts or set(task.free_cells()), goals or set(task.free_cells()))
+    if task.data_start_cells or task.data_goal_cells:
+        starts = set(task.data_start_cells or task.free_cells())
+        options["maze_map"] = _lettered(task, starts, set(task.data_goal_cells or task.free_cells()))
     return _spec(task, episode_steps, options)
 
 
@@ -259,10 +263,10 @@ def _with_progress(episodes: Iterator[dict[str, Any]], steps: int, title: str) -
 def _description(task: Task, seed: int, speed: float, noise: BehaviourNoise) -> str:
     where = "between hand-picked cells" if task.data_goal_cells else "from anywhere to anywhere"
     return (
-        f"A point mass travels {where} in {task.env_id}; a new goal follows each one reached. A planner over the "
-        f"maze's cells gives waypoints (up to {noise.waypoint_offset} cells off centre), a velocity controller "
-        f"drives at {speed} m/s with action noise {noise.action_noise}; bursts of random action last "
-        f"{noise.burst_steps[0]} to {noise.burst_steps[1]} steps. Episodes start at rest. Seed {seed}."
+        f"A point mass travels {where} in {task.env_id}; a new goal follows each one reached. A planner over "
+        f"the maze's cells gives waypoints (up to {noise.waypoint_offset} cells off centre), a velocity "
+        f"controller drives at {speed} m/s with action noise {noise.action_noise}; bursts of random action "
+        f"last {noise.burst_steps[0]} to {noise.burst_steps[1]} steps. Episodes start at rest. Seed {seed}."
     )
 
 
@@ -272,9 +276,7 @@ class WaypointController:
     `codes` is None: this actor chooses no skills.
     """
 
-    def __init__(
-        self, task: Task | str, noise: BehaviourNoise | None = None, *, speed: float = 4.5
-    ) -> None:
+    def __init__(self, task: Task | str, noise: BehaviourNoise | None = None, *, speed: float = 4.5) -> None:
         """Prepare for `task`.
 
         Args:
@@ -309,10 +311,10 @@ class WaypointController:
         Returns:
             (E, 2) forces in the box.
         """
-        goal = tuple(self.task.goal_xy().tolist())
+        goal_x, goal_y = self.task.goal_xy().tolist()
         actions = np.empty((len(self._drivers), 2), np.float32)
         for e, (driver, row) in enumerate(zip(self._drivers, observations.tolist(), strict=True)):
             if restarted is not None and restarted[e]:
                 self._restart(driver)
-            actions[e] = driver.act(*row, goal)
+            actions[e] = driver.act(row[0], row[1], row[2], row[3], (goal_x, goal_y))
         return actions

@@ -1,4 +1,4 @@
-"""Where trajectories come from: `local:DIR`, `minari:ID`, `arrays:DIR`. A new source is a new entry of `SOURCES`."""
+"""Where trajectories come from: `local:DIR`, `minari:ID`, `arrays:DIR`; a new source is one more entry."""
 
 from __future__ import annotations
 
@@ -28,11 +28,13 @@ def load_trajectories(
     """Read and check a data set.
 
     Args:
-        spec: `local:DIR`, a folder with one Minari data set; `minari:ID`, a data set under MINARI_DATASETS_PATH or
-            ~/.minari/datasets; `arrays:DIR`, what `Trajectories.save` wrote.
-        task: The task that the data must fit; None only checks that they are sound, and keeps recorded rewards.
-        reward: In mazes, "evaluation_goal" gives the reward of the task's one goal (`relabel_to_goal`), whatever
-            goals the recording had; "recorded" keeps what the environment gave. Other tasks keep theirs.
+        spec: `local:DIR`, a folder with one Minari data set; `minari:ID`, a data set under
+            MINARI_DATASETS_PATH or ~/.minari/datasets; `arrays:DIR`, what `Trajectories.save` wrote.
+        task: The task that the data must fit; None only checks that they are sound, and keeps recorded
+            rewards.
+        reward: In mazes, "evaluation_goal" gives the reward of the task's one goal (`relabel_to_goal`),
+            whatever goals the recording had; "recorded" keeps what the environment gave. Other tasks keep
+            theirs.
 
     Raises:
         UserError: For an unknown source.

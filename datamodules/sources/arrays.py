@@ -22,6 +22,7 @@ def load_arrays(directory: str, task: Task | None) -> Trajectories:
         ):
             if found != expected:
                 raise DataError(
-                    f"data set '{trajectories.name}', {what}: found {found} columns, task '{task.name}' needs {expected}"
+                    f"data set '{trajectories.name}', {what}: found {found} columns, task '{task.name}' "
+                    f"needs {expected}"
                 )
     return trajectories

@@ -14,9 +14,9 @@ from dds_lightning.tasks import Task
 def relabel_to_goal(trajectories: Trajectories, task: Task) -> Trajectories:
     """Give every step the reward of the task's own goal, and end episodes where it is reached.
 
-    `r_t = 1` if the position after step t lies within `goal_radius` of the goal, else 0. Reaching the goal ends the
-    episode (termination). What follows is a new episode, which begins with the first state outside: nobody acts
-    from a state where the task has ended, and standing on the goal is never paid twice.
+    `r_t = 1` if the position after step t lies within `goal_radius` of the goal, else 0. Reaching the goal
+    ends the episode (termination). What follows is a new episode, which begins with the first state outside:
+    nobody acts from a state where the task has ended, and standing on the goal is never paid twice.
 
         outside outside INSIDE inside inside outside outside
         └── terminated ──────┘ └─ left out ┘ └─ new episode ...
@@ -60,7 +60,7 @@ def relabel_to_goal(trajectories: Trajectories, task: Task) -> Trajectories:
 
 def _pieces(inside: NDArray[np.bool_]) -> list[tuple[int, int, bool]]:
     """Cut one episode: (first state, last state, whether the last is the goal) of each part."""
-    parts = []
+    parts: list[tuple[int, int, bool]] = []
     first, final = 0, len(inside) - 1
     while True:
         away = np.flatnonzero(~inside[first:])

@@ -1,7 +1,8 @@
-"""Reads Minari data sets without trusting them: nothing in a data set is ever run or turned into an environment.
+"""Reads Minari data sets without trusting them: nothing in a data set is ever run.
 
-Minari's own loader builds environments from `metadata.json`, and with them whatever that file names. Here the JSON is
-read first, both spaces must be there, the environment must be one of the task table, and HDF5 is read directly.
+Minari's own loader builds environments from `metadata.json`, and with them whatever that file names. Here the
+JSON is read first, both spaces must be there, the environment must be one of the task table, and HDF5 is read
+directly.
 """
 
 from __future__ import annotations
@@ -27,12 +28,12 @@ _TRUSTED_PACKAGES = ("gymnasium", "gymnasium_robotics")
 def load_minari_id(dataset_id: str, task: Task | None) -> Trajectories:
     """Read a data set of Minari's local store, by its id."""
     if not re.fullmatch(r"[\w-]+(/[\w-]+)*", dataset_id):
-        raise UserError(f"data: '{dataset_id}' is no Minari id, expected for example pointmaze-large-diverse-v0")
+        raise UserError(f"data: '{dataset_id}' is no Minari id; one is pointmaze-large-diverse-v0")
     folder = minari_root() / dataset_id
     if not folder.is_dir():
         raise DataError(
-            f"data set '{dataset_id}' is not in {minari_root()}; collect it with `dds data collect`, download it with "
-            "`minari download`, or set MINARI_DATASETS_PATH"
+            f"data set '{dataset_id}' is not in {minari_root()}; collect it with `dds data collect`, "
+            "download it with `minari download`, or set MINARI_DATASETS_PATH"
         )
     return load_local(str(folder), task)
 
@@ -76,22 +77,24 @@ def read_metadata(data: Path) -> dict[str, Any]:
     """Read and check `metadata.json`; the environment it names must be one of the task table.
 
     Raises:
-        DataError: When it is missing, damaged, lacks a space, or names an unknown environment or foreign code.
+        DataError: When it is missing, damaged, lacks a space, or names an unknown environment or foreign
+            code.
     """
     path = data / "metadata.json"
     if not path.is_file():
-        raise DataError(f"data: {path} is missing, so {data} holds no Minari data set; found {_listing(data)}")
+        raise DataError(
+            f"data: {path} is missing, so {data} holds no Minari data set; found {_listing(data)}"
+        )
     try:
-        metadata = json.loads(path.read_text(encoding="utf-8"))
-        assert isinstance(metadata, dict)
-    except (ValueError, AssertionError) as error:
+        metadata = dict(json.loads(path.read_text(encoding="utf-8")))
+    except (ValueError, TypeError, RecursionError) as error:
         raise DataError(f"data: {path} is damaged: it holds no JSON object ({error})") from error
     name = metadata.get("dataset_id", data.parent.name)
     for key in ("observation_space", "action_space"):
         if not isinstance(metadata.get(key), str):
             raise DataError(
-                f"data set '{name}': metadata.json has no {key}; Minari would run the environment that the file names "
-                "to find out, so such data sets are refused"
+                f"data set '{name}': metadata.json has no {key}; Minari would run the environment that the "
+                "file names to find out, so such data sets are refused"
             )
         try:
             metadata[key] = json.loads(metadata[key])
@@ -108,10 +111,11 @@ def _env_spec(name: str, text: Any) -> dict[str, Any] | None:
         return None
     try:
         spec = json.loads(text)
-        env_id, entry, wrappers = spec["id"], spec.get("entry_point"), spec.get("additional_wrappers")
+        env_id, code = str(spec["id"]), [spec.get("entry_point")]
+        code += [wrapper["entry_point"] for wrapper in spec.get("additional_wrappers") or ()]
+        spec["kwargs"] = dict(spec.get("kwargs") or {})
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise DataError(f"data set '{name}': env_spec in metadata.json is damaged ({error!r})") from error
-    code = [entry, *(w.get("entry_point") if isinstance(w, dict) else w for w in wrappers or [])]
     for found in code:
         if found is not None and str(found).partition(":")[0].partition(".")[0] not in _TRUSTED_PACKAGES:
             raise DataError(
@@ -119,7 +123,9 @@ def _env_spec(name: str, text: Any) -> dict[str, Any] | None:
                 f"{' and '.join(_TRUSTED_PACKAGES)}; do not open this data set with other tools"
             )
     if env_id not in known_env_ids():
-        raise DataError(f"data set '{name}': it was recorded in '{env_id}', which no task uses; see `dds tasks`")
+        raise DataError(
+            f"data set '{name}': it was recorded in '{env_id}', which no task uses; see `dds tasks`"
+        )
     return dict(spec)
 
 
@@ -127,21 +133,22 @@ def _check_task(name: str, metadata: dict[str, Any], task: Task) -> None:
     spec = metadata["env_spec"]
     if spec is None:
         raise DataError(
-            f"data set '{name}': metadata.json has no env_spec, so nothing says that it was recorded in {task.env_id}, "
-            f"which task '{task.name}' needs"
+            f"data set '{name}': metadata.json has no env_spec, so nothing says that it was recorded in "
+            f"{task.env_id}, which task '{task.name}' needs"
         )
     if spec["id"] not in (task.env_id, *task.data_env_ids):
         raise DataError(
-            f"data set '{name}' was recorded in {spec['id']}, but task '{task.name}' needs {task.env_id}; choose the "
-            "task that fits the data, or other data"
+            f"data set '{name}' was recorded in {spec['id']}, but task '{task.name}' needs {task.env_id}; "
+            "choose the task that fits the data, or other data"
         )
-    maze_map = (spec.get("kwargs") or {}).get("maze_map")
+    maze_map = spec["kwargs"].get("maze_map")
     if task.maze_map is not None and maze_map is not None:
-        walls = tuple("".join("1" if value == 1 else "0" for value in row) for row in maze_map)
+        rows = [_as_list(row) for row in _as_list(maze_map)]
+        walls = tuple("".join("1" if value == 1 else "0" for value in row) for row in rows)
         if walls != task.maze_map:
             raise DataError(
-                f"data set '{name}' was recorded in {spec['id']} with other walls ({'/'.join(walls)}) than task "
-                f"'{task.name}' has ({'/'.join(task.maze_map)})"
+                f"data set '{name}' was recorded in {spec['id']} with other walls ({'/'.join(walls)}) than "
+                f"task '{task.name}' has ({'/'.join(task.maze_map)})"
             )
 
 
@@ -149,13 +156,16 @@ def _action_box(name: str, metadata: dict[str, Any]) -> tuple[NDArray[np.float32
     space = metadata["action_space"]
     try:
         low, high = (np.array(space[key], np.float32).reshape(-1) for key in ("low", "high"))
-        assert space["type"] == "Box"
-        assert low.shape == high.shape == (int(np.prod(space["shape"])),)
-        assert np.isfinite(low).all()
-        assert np.isfinite(high).all()
-    except (KeyError, TypeError, ValueError, AssertionError) as error:
-        raise DataError(f"data set '{name}': its action space is {space}, expected a bounded Box") from error
+        sound = space["type"] == "Box" and low.shape == high.shape == (int(np.prod(space["shape"])),)
+    except (KeyError, TypeError, ValueError):
+        sound = False
+    if not sound or not np.isfinite([low, high]).all():
+        raise DataError(f"data set '{name}': its action space is {space}, expected a bounded Box")
     return low, high
+
+
+def _as_list(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [value]
 
 
 def _read_hdf5(
@@ -165,10 +175,11 @@ def _read_hdf5(
         with h5py.File(path, "r") as file:
             labels = sorted(file, key=lambda key: int(key.removeprefix("episode_")))
             total = metadata.get("total_episodes")
-            if total is not None and labels != [f"episode_{i}" for i in range(int(total))]:
+            in_order = labels == [f"episode_{i}" for i in range(len(labels))]
+            if total is not None and (len(labels) != total or not in_order):
                 raise DataError(
-                    f"data set '{name}': metadata.json promises {total} episodes, but {path} holds {len(labels)}"
-                    f"{f' ({labels[0]} to {labels[-1]})' if labels else ''}"
+                    f"data set '{name}': metadata.json promises {total} episodes, but {path} holds "
+                    f"{len(labels)}{f' ({labels[0]} to {labels[-1]})' if labels else ''}"
                 )
             episodes = [_read_episode(file, name, label, task) for label in labels]
     except DataError:
@@ -178,7 +189,9 @@ def _read_hdf5(
     steps = sum(len(fields["rewards"]) for fields in episodes)
     promised = metadata.get("total_steps")
     if promised is not None and steps != promised:
-        raise DataError(f"data set '{name}': metadata.json promises {promised} steps, but {path} holds {steps}")
+        raise DataError(
+            f"data set '{name}': metadata.json promises {promised} steps, but {path} holds {steps}"
+        )
     return labels, episodes
 
 
@@ -204,7 +217,9 @@ def _read_episode(file: h5py.File, name: str, label: str, task: Task | None) -> 
 def _observation(group: h5py.Group, key: str, where: str, task: Task | None) -> h5py.Dataset:
     """The flat part of a dictionary observation; goals are left out, because a task has one."""
     if key != "observations" or "observation" not in group:
-        raise DataError(f"{where}, {key}: found the entries {', '.join(group) or 'none'}, expected 'observation'")
+        raise DataError(
+            f"{where}, {key}: found the entries {', '.join(group) or 'none'}, expected 'observation'"
+        )
     node = _member(group, "observation", f"{where}, {key}")
     if not isinstance(node, h5py.Dataset):
         raise DataError(f"{where}, {key}: 'observation' is no array")

@@ -1,8 +1,9 @@
 """The command line `dds`. Nothing heavy is imported before the command is known.
 
-A function of `commands` is a command: its signature is the command line and its docstring the help. `dds skill` and
-`dds policy` are Lightning's own command lines (`fitting`). What a command returns is printed, as text for a person or,
-with `--json`, as one JSON document with nothing beside it on standard output; progress and logs go to standard error.
+A function of `commands` is a command: its signature is the command line and its docstring the help. `dds
+skill` and `dds policy` are Lightning's own command lines (`fitting`). What a command returns is printed, as
+text for a person or, with `--json`, as one JSON document with nothing beside it on standard output; progress
+and logs go to standard error.
 """
 
 import shlex
@@ -51,13 +52,14 @@ def _dispatch(words: list[str]) -> int:
         return 0
     try:
         if words and words[0] in STAGES:
-            from dds_lightning.cli.fitting import command
+            from dds_lightning.fitting import command
 
             as_json, work = "--json" in words, command(words[0], words[1:])
         else:
             as_json, work = _command(words)
     except ArgumentError as error:
-        asked = shlex.join(["dds", *(word for word in words[:2] if word.isalpha())])
+        known = STAGES.keys() | {"run", "relabel", "evaluate", "data", "tasks"}
+        asked = shlex.join(["dds", *(words[:1] if words[:1] and words[0] in known else [])])
         return _complain(f"{str(error.message).strip()} (see `{asked} --help`)")
     except SystemExit as stop:  # --help and --print_config end so
         if isinstance(stop, Interrupted):
@@ -84,7 +86,7 @@ def _command(words: list[str]) -> tuple[bool, Callable[[], Any]]:
 
 def _report(work: Callable[[], Any], as_json: bool) -> int:
     """Do the work with standard output turned away, then print what it returned."""
-    from dds_lightning.cli.reports import Report
+    from dds_lightning.reports import Report
 
     with redirect_stdout(sys.stderr):
         report = work()

@@ -4,10 +4,13 @@ Heavy imports stay inside the functions, so that `dds tasks` need not wait for t
 """
 
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from dds_lightning.cli.reports import Report, table
 from dds_lightning.errors import UserError
+from dds_lightning.reports import Report, table
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def run(
@@ -18,6 +21,9 @@ def run(
     preset: str | None = None,
     data_steps: int = 200_000,
     episodes: int | None = None,
+    episodes_per_skill: int = 20,
+    selection: Literal["sample", "greedy", "argmax_q"] = "sample",
+    temperature: float = 1.0,
     workers: int | None = None,
     until: Literal["data", "skill", "relabel", "policy", "clone", "evaluate", "report"] = "report",
     fresh: bool = False,
@@ -26,18 +32,23 @@ def run(
 ) -> Report:
     """Do everything for one task: data, skills, relabelling, policy, baseline, evaluation, report.
 
-    What is done is not done twice: call it again after an interruption and it goes on where it stopped; change a
-    setting and the stages that it touches are done again. Every setting of the two trainings can be given as
-    --skill.KEY=VALUE and --policy.KEY=VALUE, for example --skill.trainer.max_steps=500 --policy.model.alpha=5.
+    What is done is not done twice: call it again after an interruption and it goes on where it stopped;
+    change a setting and the stages that it touches are done again. Every setting of the two trainings can be
+    given as --skill.KEY=VALUE and --policy.KEY=VALUE, for example --skill.trainer.max_steps=500
+    --policy.model.alpha=5.
 
     Args:
         task: name of a task; `dds tasks` lists them
         out: folder of the run; without it runs/TASK
         data: your data, local:DIR or minari:ID; without it data are collected in the environment
         seed: of everything random: data, both trainings and the evaluation
-        preset: packaged pair of configurations (pointmaze, paper), or a folder with skill.yaml and policy.yaml; without it the task family's
+        preset: packaged pair of configurations (pointmaze, paper), or a folder with skill.yaml and
+            policy.yaml; without it the task family's
         data_steps: environment steps to collect
         episodes: evaluation episodes of each contestant; without it the task's own number
+        episodes_per_skill: evaluation episodes of each single skill alone
+        selection: how the published agent chooses skills; the table shows every way
+        temperature: of `sample`; below 1 is nearer to greedy
         workers: processes for environments; without it one for every core
         until: the last stage to do
         fresh: do every stage again
@@ -55,6 +66,9 @@ def run(
             preset=preset,
             data_steps=data_steps,
             episodes=episodes,
+            episodes_per_skill=episodes_per_skill,
+            selection=selection,
+            temperature=temperature,
             workers=workers,
             until=until,
             fresh=fresh,
@@ -88,8 +102,8 @@ def relabel(
         reward_scale: factor on the learning reward; without it the task's
         reward_shift: shift of the learning reward; without it the task's
     """
-    from datamodules.relabel import relabel_key
     from datamodules.relabel import relabel as relabel_data
+    from datamodules.relabel import relabel_key
     from datamodules.relabeled import RelabeledDataModule
 
     module = RelabeledDataModule(
@@ -135,11 +149,43 @@ def evaluate(
         workers: processes for environments; without it one for every core
         out: Parquet file for the table of episodes
     """
-    from dds_lightning.contestants import evaluate_agent
+    from dds_lightning.agent import DDSAgent
+    from dds_lightning.checkpointing import load_published
+    from dds_lightning.contestants import agent_directory, way
+    from dds_lightning.rollout import rollout
+    from dds_lightning.tasks import get_task
 
-    return evaluate_agent(
-        Path(directory), task, episodes, tuple(selection), temperature, seed, workers, Path(out) if out else None
+    path = agent_directory(Path(directory))
+    name = task or load_published(path).config.get("task")
+    if name is None:
+        raise UserError(f"{path} does not say which task it is for: give --task")
+    wanted = get_task(name)
+    count = wanted.evaluation_episodes if episodes is None else episodes
+    if count < 1:
+        raise UserError(f"--episodes is {count}, expected at least 1")
+    agent = DDSAgent.load(path, seed=seed)
+    found, expected = (agent.observation_dim, agent.action_dim), (wanted.observation_dim, wanted.action_dim)
+    if found != expected:
+        raise UserError(
+            f"the agent in {path} has (observation_dim, action_dim) {found}, task {name} has {expected}:  "
+            "it was trained for another task"
+        )
+    ways = [
+        way(agent, choice, count, temperature if choice == "sample" else 1.0)
+        for choice in dict.fromkeys(selection)
+    ]
+    result = rollout(wanted, ways, seed=seed, workers=workers)
+    summary = result.summary()
+    report = Report(
+        {"agent": path, "task": name, "seed": seed, "results": summary},
+        [table(summary, f"{name}: {count} episodes each, seed {seed}")],
     )
+    if out is not None:
+        Path(out).parent.mkdir(parents=True, exist_ok=True)
+        result.episodes.to_parquet(out, index=False)
+        report.data["episodes"] = out
+        report.text.append(out)
+    return report
 
 
 def data_collect(
@@ -169,33 +215,43 @@ def data_collect(
     )
 
 
-def data_check(data: str, task: str | None = None) -> Report:
+def data_check(data: str, task: str | None = None, horizon: int | None = None) -> Report:
     """Read a data set from end to end and say what is wrong with it, if anything.
 
     Args:
         data: local:DIR, minari:ID or a folder
         task: name of the task that the data should fit
+        horizon: also count segments of this many steps, and refuse data without one
     """
     from datamodules.inspection import check_dataset
 
-    facts = check_dataset(_spec(data), task)
+    facts = check_dataset(_spec(data), task, horizon=horizon)
     return Report(
-        {"data": _spec(data), "task": task, "sound": True, **facts}, [_facts(facts), f"{_spec(data)} is sound"]
+        {"data": _spec(data), "task": task, "sound": True, "facts": _facts(facts)},
+        [table(facts), f"{_spec(data)} is sound" + (f" and fits {task}" if task else "")],
     )
 
 
-def data_show(data: str, task: str | None = None) -> Report:
-    """Show what is in a data set: episodes, steps, rewards, and the range of every dimension.
+def data_show(data: str, task: str | None = None, episodes: int = 20) -> Report:
+    """Show what is in a data set and its longest episodes.
 
     Args:
         data: local:DIR, minari:ID or a folder
         task: name of the task; with it mazes get the reward of the task's goal
+        episodes: rows of the table of episodes
     """
     from datamodules import load_trajectories
-    from datamodules.inspection import describe
+    from datamodules.inspection import describe, episode_table
+    from dds_lightning.tasks import get_task
 
-    facts, dimensions = describe(load_trajectories(_spec(data), task))
-    return Report({"data": _spec(data), **facts, "dimensions": dimensions}, [_facts(facts), table(dimensions)])
+    chosen = get_task(task) if task else None
+    trajectories = load_trajectories(_spec(data), chosen)
+    facts = describe(trajectories, task=chosen)
+    rows = episode_table(trajectories).sort_values("steps", ascending=False, kind="stable").head(episodes)
+    return Report(
+        {"data": _spec(data), "task": task, "facts": _facts(facts), "episodes": rows},
+        [table(facts), table(rows, f"the {len(rows)} longest episodes")],
+    )
 
 
 def data_list(root: list[str] = ["data"]) -> Report:  # noqa: B006
@@ -204,12 +260,15 @@ def data_list(root: list[str] = ["data"]) -> Report:  # noqa: B006
     Args:
         root: folders to look in beside MINARI_DATASETS_PATH (or ~/.minari/datasets)
     """
-    from datamodules.inspection import find_datasets
+    import pandas as pd
 
-    found = find_datasets([Path(folder) for folder in root])
+    from datamodules.inspection import list_datasets
+
+    looked: list[str | None] = [None, *(folder for folder in root if Path(folder).is_dir())]
+    found = pd.concat([list_datasets(folder) for folder in looked], ignore_index=True)
     if found.empty:
-        looked = ", ".join(root)
-        return Report([], [f"no data sets in {looked} or Minari's folder; make one with `dds data collect TASK`"])
+        where = ", ".join(["Minari's folder", *root])
+        return Report(found, [f"no data sets in {where}; make one with `dds data collect TASK`"])
     return Report(found, [table(found)])
 
 
@@ -230,6 +289,6 @@ def _spec(data: str) -> str:
     return data
 
 
-def _facts(facts: dict[str, object]) -> str:
-    width = max(map(len, facts), default=0)
-    return "\n".join(f"{name:<{width}}  {value}" for name, value in facts.items())
+def _facts(frame: "pd.DataFrame") -> dict[str, object]:
+    """The rows of a table of facts as one mapping."""
+    return dict(zip(frame["fact"], frame["value"], strict=True))

@@ -66,8 +66,8 @@ def _add(
 def prepare(words: list[str]) -> list[str]:
     """Rewrite the two shorthands that jsonargparse does not know.
 
-    A bare `--fresh` means `--fresh=true`, and for `dds run` an option like `--skill.trainer.max_steps=100` (or the
-    same as two words) is collected for the `fit` command of that stage.
+    A bare `--fresh` means `--fresh=true`, and for `dds run` an option like `--skill.trainer.max_steps=100`
+    (or the same as two words) is collected for the `fit` command of that stage.
 
     Raises:
         UserError: such an option without a value.

@@ -1,8 +1,8 @@
 """`dds skill` and `dds policy`: Lightning's command line over our modules, with its traps closed.
 
 - Dimensions come from the data (`data.observation_dim` -> `model.observation_dim`), never from the user.
-- `--ckpt_path` continues a training. The settings of the model come from the checkpoint; naming another value for
-  one of them is refused instead of being ignored.
+- `--ckpt_path` continues a training. The settings of the model come from the checkpoint; naming another value
+  for one of them is refused instead of being ignored.
 - A mistake in the data is found before the first file is written.
 """
 
@@ -21,10 +21,10 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from datamodules.relabeled import RelabeledDataModule
 from datamodules.segments import SegmentDataModule
 from dds_lightning import interrupts
-from dds_lightning.cli.configs import resolve_configs
-from dds_lightning.cli.reports import Report, table
+from dds_lightning.configs import resolve_configs
 from dds_lightning.errors import UserError
 from dds_lightning.policy import PolicyModule
+from dds_lightning.reports import Report, table
 from dds_lightning.skill import SkillModule
 from dds_lightning.training import BestCheckpoint, RollingCheckpoint, trainer_settings
 
@@ -86,13 +86,12 @@ class StageCLI(LightningCLI):
         if path is None:
             if self.config.subcommand != "fit" and not self.parse_only:
                 raise UserError(
-                    f"--ckpt_path is missing: `dds {self.stage} {self.config.subcommand}` needs the checkpoint to "
-                    "look at"
+                    f"--ckpt_path is missing: `dds {self.stage} {self.config.subcommand}` needs a checkpoint"
                 )
             return
         if settings.model.get("init_from") is not None:
             raise UserError(
-                "--ckpt_path continues a training and --model.init_from starts a new one from its weights: give one"
+                "--ckpt_path continues a training, --model.init_from starts a new one from weights: give one"
             )
         self.checkpoint = load_checkpoint(path, self.stage)
         trained = dict(self.checkpoint["hyper_parameters"])
@@ -100,8 +99,8 @@ class StageCLI(LightningCLI):
         for name, value in trained.items():
             if name in chosen and chosen[name] != value:
                 raise UserError(
-                    f"--model.{name} is {chosen[name]!r}, but checkpoint {path} was trained with {value!r}, and "
-                    "--ckpt_path continues exactly that training: leave the setting out, or train anew"
+                    f"--model.{name} is {chosen[name]!r}, but checkpoint {path} was trained with {value!r}, "
+                    "and --ckpt_path continues exactly that training: leave the setting out, or train anew"
                 )
             if name not in LINKS[self.stage] and name in settings.model:
                 settings.model[name] = value
@@ -124,11 +123,12 @@ class StageCLI(LightningCLI):
             return
         super().instantiate_classes()
         trained = (self.checkpoint or {}).get("hyper_parameters", {})
+        path = self._get(self.config, "ckpt_path")
         for name in LINKS[self.stage]:
             if name in trained and trained[name] != self.model.hparams[name]:
                 raise UserError(
-                    f"checkpoint {self._get(self.config, 'ckpt_path')} was trained with {name} {trained[name]}, the "
-                    f"data have {self.model.hparams[name]}: use a checkpoint and data of the same task"
+                    f"checkpoint {path} was trained with {name} {trained[name]}, the data have "
+                    f"{self.model.hparams[name]}: use a checkpoint and data of the same task"
                 )
 
     def _instantiate_trainer(self, config: dict[str, Any], callbacks: list[pl.Callback]) -> pl.Trainer:
@@ -157,7 +157,12 @@ class StageCLI(LightningCLI):
                 (c.path for c in self.trainer.checkpoint_callbacks if isinstance(c, RollingCheckpoint)), None
             ),
             "best": next(
-                (c.best_model_path for c in self.trainer.checkpoint_callbacks if isinstance(c, BestCheckpoint)), None
+                (
+                    c.best_model_path
+                    for c in self.trainer.checkpoint_callbacks
+                    if isinstance(c, BestCheckpoint)
+                ),
+                None,
             )
             or None,
         }
@@ -243,7 +248,7 @@ def command(stage: str, words: Sequence[str]) -> Callable[[], Report]:
     quieten()
     if not words:
         words = ["--help"]
-    return lambda: StageCLI(stage, words).execute()
+    return StageCLI(stage, words).execute
 
 
 def settings_of(stage: str, words: Sequence[str]) -> dict[str, Any]:

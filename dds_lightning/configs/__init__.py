@@ -1,12 +1,11 @@
 """The packaged configurations and how a command line finds them."""
 
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
 
 from dds_lightning.errors import UserError
 
-ROOT = Path(str(files("dds_lightning") / "configs"))
+ROOT = Path(__file__).parent
 
 
 def packaged() -> list[str]:

@@ -3,8 +3,7 @@
 import json
 import math
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +24,7 @@ class Report:
     """
 
     data: Any
-    text: Sequence["RenderableType"] = ()
+    text: list["RenderableType"] = field(default_factory=list)
     status: int = 0
 
     def print(self, as_json: bool) -> None:
@@ -42,7 +41,7 @@ class Report:
 
 
 def plain(value: Any) -> Any:
-    """Turn tables, arrays, paths and tuples into what JSON can say; a number that is not finite becomes null."""
+    """Turn tables, arrays, paths and tuples into what JSON can say; NaN and infinity become null."""
     if hasattr(value, "to_dict") and hasattr(value, "columns"):
         return [plain(row) for row in value.to_dict(orient="records")]
     if hasattr(value, "tolist"):

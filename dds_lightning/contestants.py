@@ -1,0 +1,95 @@
+"""Who plays in the final table: one agent whose skills are chosen in several ways, and its baselines."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dds_lightning.errors import UserError
+from dds_lightning.rollout import Contestant, single_skills
+from dds_lightning.tasks import Task
+
+if TYPE_CHECKING:
+    from dds_lightning.agent import DDSAgent
+
+WAYS = ("greedy", "sample", "argmax_q", "random")
+COOL = 0.5
+"""Temperature of the row between greedy and sampled."""
+
+
+def way_name(selection: str, temperature: float = 1.0) -> str:
+    """What the table calls a way of choosing skills."""
+    if selection == "sample":
+        return "AWR policy, sampled" + ("" if temperature == 1.0 else f" at temperature {temperature:g}")
+    names = {"greedy": "AWR policy, greedy", "argmax_q": "argmax-Q", "random": "random skills"}
+    if selection not in names:
+        raise UserError(f"selection is {selection!r}, expected one of {', '.join(WAYS)}")
+    return names[selection]
+
+
+def way(agent: "DDSAgent", selection: str, episodes: int, temperature: float = 1.0) -> Contestant:
+    """One way of choosing skills as a contestant."""
+    name = way_name(selection, temperature)
+    return Contestant(name, agent.variant(selection, temperature=temperature), episodes)  # type: ignore[arg-type]
+
+
+def final_table(
+    agent: "DDSAgent",
+    task: Task,
+    episodes: int,
+    episodes_per_skill: int,
+    clone: Any = None,
+    controller: Any = None,
+) -> list[Contestant]:
+    """Everyone in the table at the end of `dds run`.
+
+    Args:
+        agent: the trained agent; its own selection and temperature are the table's first row.
+        task: where they play.
+        episodes: for each contestant.
+        episodes_per_skill: for each single skill alone.
+        clone: actor of the behaviour-cloning baseline, if there is one.
+        controller: actor that made the data, if there is one.
+    """
+    ways = [
+        (agent.selection, agent.temperature),
+        ("greedy", 1.0),
+        ("sample", COOL),
+        ("sample", 1.0),
+        ("argmax_q", 1.0),
+    ]
+    table = {
+        way_name(*choice): way(agent, choice[0], episodes, choice[1]) for choice in [*ways, ("random", 1.0)]
+    }
+    contestants = [*table.values(), single_skills(agent, episodes_per_skill)]
+    if clone is not None:
+        contestants.append(Contestant("behaviour cloning", clone, episodes))
+    if controller is not None:
+        contestants.append(Contestant("the data's controller", controller, episodes))
+    return contestants
+
+
+def behaviour_controller(task: Task) -> Any:
+    """The actor that made a collected set, with the noise that it had there; None where there is none."""
+    if task.family != "pointmaze":
+        return None
+    from datamodules.collect.behaviour import BehaviourNoise
+    from datamodules.collect.pointmaze import WaypointController
+
+    return WaypointController(task, BehaviourNoise())
+
+
+def agent_directory(directory: Path) -> Path:
+    """The published agent of a run directory, or the directory itself if it is a published one.
+
+    Raises:
+        UserError: it is neither.
+    """
+    if not directory.is_dir():
+        raise UserError(f"there is no folder {directory}: give a run of `dds run` or a published checkpoint")
+    for candidate in (directory / "agent", directory):
+        if (candidate / "model.safetensors").is_file():
+            return candidate
+    there = ", ".join(sorted(entry.name for entry in directory.iterdir())) or "nothing"
+    raise UserError(
+        f"{directory} is neither a finished run (no agent/model.safetensors) nor a published checkpoint: "
+        f"it holds {there}"
+    )

@@ -1,0 +1,249 @@
+"""A run directory that knows what is done: stages with markers, skipped, resumed or redone.
+
+```
+ runs/TASK/
+   run.lock              held while a `dds run` works here
+   STAGE/…               what the stage wrote
+   STAGE/stage.json      state, settings, fingerprint of its inputs and outputs, seconds
+   previous/STAGE/…      the last result that other settings replaced
+```
+
+A stage is *done* when its marker says so, its settings and the outputs of the stages it reads from are the
+same as now, and its own outputs are still there. It is *resumed* when it was started with exactly these
+settings and inputs and not finished. In every other case what lies there moves to `previous/` and it starts
+anew.
+"""
+
+import fcntl
+import hashlib
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from dds_lightning.errors import UserError
+
+FORMAT = 1
+MARKER = "stage.json"
+Work = Callable[[Path, bool], Mapping[str, Any]]
+
+
+@dataclass
+class Done:
+    """A finished stage.
+
+    Attributes:
+        name: of the stage.
+        folder: where its files are.
+        outputs: name -> path of what the next stages read.
+        facts: small results worth keeping in the marker; the same for the same outputs.
+        digest: of outputs and facts; the next stages' markers hold it.
+        seconds: that the work took, interruptions left out.
+        skipped: whether it had been done before.
+    """
+
+    name: str
+    folder: Path
+    outputs: dict[str, Path]
+    facts: dict[str, Any] = field(default_factory=dict)
+    digest: str = ""
+    seconds: float = 0.0
+    skipped: bool = False
+
+
+class Stages:
+    """The stages of one run directory.
+
+    Args:
+        root: the run directory.
+        console: where progress is told.
+        fresh: take nothing for done.
+    """
+
+    def __init__(self, root: Path, console: Console, fresh: bool = False) -> None:
+        self.root, self.console, self.fresh = root, console, fresh
+        self.done: list[Done] = []
+
+    def do(self, name: str, title: str, settings: Mapping[str, Any], reads: list[Done], work: Work) -> Done:
+        """Do one stage, or find it done.
+
+        Args:
+            name: of the stage and its folder.
+            title: what a person reads while it runs.
+            settings: everything that its result depends on, apart from `reads`; JSON values.
+            reads: the stages whose outputs it uses.
+            work: called with (folder, resuming); returns outputs (values that are paths in the folder) and
+                facts.
+        """
+        folder = self.root / name
+        expected = {"settings": _json(settings), "inputs": {stage.name: stage.digest for stage in reads}}
+        marker = _read(folder / MARKER)
+        same = {key: marker.get(key) for key in expected} == expected and marker.get("format") == FORMAT
+        if (
+            same
+            and marker.get("state") == "finished"
+            and not self.fresh
+            and (found := _found(folder, marker))
+        ):
+            self._say(f"{title}: done before, in {duration(found.seconds)}", "dim")
+            self.done.append(found)
+            return found
+
+        resuming = same and marker.get("state") == "started" and not self.fresh
+        if resuming:
+            self._say(f"{title}: going on after {duration(marker.get('seconds', 0.0))}", "bold")
+        else:
+            reason = "" if not marker or self.fresh else f" again ({_difference(marker, expected)})"
+            self._say(f"{title}{reason}", "bold")
+            _put_away(folder, self.root / "previous" / name)
+        folder.mkdir(parents=True, exist_ok=True)
+        before = float(marker.get("seconds", 0.0)) if resuming else 0.0
+        record = {"format": FORMAT, "stage": name, "state": "started", **expected, "seconds": before}
+        write_json(folder / MARKER, record)
+        started = time.monotonic()
+        try:
+            made = dict(work(folder, resuming))
+        except BaseException:
+            write_json(folder / MARKER, {**record, "seconds": before + time.monotonic() - started})
+            raise
+        outputs = {key: value for key, value in made.items() if isinstance(value, Path)}
+        facts = _json({key: value for key, value in made.items() if key not in outputs})
+        seconds = before + time.monotonic() - started
+        files = {key: _digest(path) for key, path in outputs.items()}
+        record |= {
+            "state": "finished",
+            "seconds": round(seconds, 2),
+            "finished": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+            "outputs": {key: os.path.relpath(path, folder) for key, path in outputs.items()},
+            "files": files,
+            "facts": facts,
+        }
+        write_json(folder / MARKER, record)
+        result = Done(name, folder, outputs, facts, _join(files, facts), seconds)
+        self._say(f"{title}: {duration(seconds)}", "green")
+        self.done.append(result)
+        return result
+
+    def _say(self, text: str, style: str) -> None:
+        self.console.print(f"[{style}]{text}[/]", highlight=False)
+
+
+@contextmanager
+def locked(root: Path) -> Iterator[None]:
+    """Keep a second `dds run` out of the directory while this one works.
+
+    Raises:
+        UserError: somebody else is working there, or it is no folder.
+    """
+    if root.exists() and not root.is_dir():
+        raise UserError(f"out: {root} is a file, expected a folder for the run")
+    created = not root.exists()
+    root.mkdir(parents=True, exist_ok=True)
+    path = root / "run.lock"
+    try:
+        with path.open("w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise UserError(
+                    f"out: another `dds run` is working in {root}: wait for it, or choose another --out"
+                ) from None
+            yield
+    finally:
+        # A run that ended before its first stage leaves nothing behind.
+        if created and [entry.name for entry in root.iterdir()] == [path.name]:
+            shutil.rmtree(root)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON so that a reader sees the old file or the new one, and never half of one."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("w", encoding="utf-8") as file:
+            json.dump(value, file, indent=2, allow_nan=False)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def duration(seconds: float) -> str:
+    """`83` as `1 min 23 s`."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min {rest} s" if minutes else f"{rest} s" if seconds >= 10 else f"{seconds:.1f} s"
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return value if isinstance(value, dict) else {}
+
+
+def _found(folder: Path, marker: dict[str, Any]) -> Done | None:
+    """The stage as it was finished, if its outputs are all as they were."""
+    outputs = {key: folder / relative for key, relative in marker["outputs"].items()}
+    if any(not path.exists() or _digest(path) != marker["files"][key] for key, path in outputs.items()):
+        return None
+    digest, seconds = _join(marker["files"], marker["facts"]), float(marker["seconds"])
+    return Done(marker["stage"], folder, outputs, marker["facts"], digest, seconds, skipped=True)
+
+
+def _digest(path: Path) -> str:
+    """SHA-256 of a file, or of every file under a folder with its name."""
+    digest = hashlib.sha256()
+    files = sorted(entry for entry in path.rglob("*") if entry.is_file()) if path.is_dir() else [path]
+    for entry in files:
+        digest.update(str(entry.relative_to(path)).encode())
+        with entry.open("rb") as file:
+            while block := file.read(1 << 20):
+                digest.update(block)
+    return digest.hexdigest()
+
+
+def _join(files: Mapping[str, str], facts: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps([files, facts], sort_keys=True).encode()).hexdigest()
+
+
+def _json(value: Any) -> Any:
+    return json.loads(json.dumps(value, default=str))
+
+
+def _put_away(folder: Path, previous: Path) -> None:
+    if not folder.exists():
+        return
+    if previous.exists():
+        shutil.rmtree(previous)
+    previous.parent.mkdir(parents=True, exist_ok=True)
+    os.replace(folder, previous)
+
+
+def _difference(marker: dict[str, Any], expected: dict[str, Any]) -> str:
+    """In a few words, why a stage is done again."""
+    old, new = _flat(marker.get("settings") or {}), _flat(expected["settings"])
+    changed = [name for name in {**old, **new} if old.get(name) != new.get(name)]
+    if changed:
+        shown = ", ".join(f"{name} {old.get(name)!r} -> {new.get(name)!r}" for name in changed[:3])
+        return shown + (f" and {len(changed) - 3} more" if len(changed) > 3 else "")
+    inputs = marker.get("inputs") or {}
+    stale = [name for name, digest in expected["inputs"].items() if inputs.get(name) != digest]
+    return f"{', '.join(stale)} changed" if stale else "its files changed"
+
+
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in settings.items():
+        flat.update(_flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value})
+    return flat

@@ -1,0 +1,84 @@
+"""The project as pip sees it: metadata, constraints, and the wheel."""
+
+import re
+import subprocess
+import sys
+import tomllib
+import zipfile
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+import dds_lightning
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
+def _pins():
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    return dict(line.split("==") for line in lines if line and not line.startswith("#"))
+
+
+def _requirements():
+    groups = [PROJECT["dependencies"], *PROJECT["optional-dependencies"].values()]
+    return [re.match(r"[\w-]+", line)[0].lower() for group in groups for line in group]
+
+
+def test_every_requirement_has_an_exact_version():
+    missing = [name for name in _requirements() if name not in _pins()]
+    assert missing == []
+    assert all(re.fullmatch(r"\d[\w.!+]*", version) for version in _pins().values())
+
+
+def test_every_exact_version_is_inside_its_range():
+    from packaging.requirements import Requirement
+
+    groups = [PROJECT["dependencies"], *PROJECT["optional-dependencies"].values()]
+    for line in (line for group in groups for line in group):
+        requirement = Requirement(line)
+        assert requirement.specifier.contains(_pins()[requirement.name.lower()]), line
+
+
+def test_versions_known_to_be_bad_are_excluded():
+    lines = {re.match(r"[\w-]+", line)[0]: line for line in PROJECT["dependencies"]}
+    assert lines["lightning"] == "lightning>=2.6.6,<2.7"
+    assert lines["mujoco"] == "mujoco>=3.3,<3.12"
+    assert lines["torch"] == "torch>=2.6"
+
+
+def test_the_public_names_import():
+    for name in dds_lightning.__all__:
+        assert getattr(dds_lightning, name) is not None
+    with pytest.raises(AttributeError, match="no_such_name"):
+        _ = dds_lightning.no_such_name
+
+
+@pytest.mark.skipif(find_spec("hatchling") is None, reason="hatchling (extra: dev) builds the wheel")
+def test_the_wheel_holds_both_packages_and_the_configurations_and_runs(tmp_path):
+    command = [sys.executable, "-m", "pip", "wheel", str(ROOT), "--no-deps", "--no-build-isolation"]
+    made = subprocess.run([*command, "-w", str(tmp_path)], capture_output=True, text=True, check=False)
+    assert made.returncode == 0, made.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+        archive.extractall(tmp_path / "site")
+    configs = (ROOT / "dds_lightning" / "configs").rglob("*.yaml")
+    expected = {str(path.relative_to(ROOT)) for path in configs}
+    expected |= {"dds_lightning/cli/__init__.py", "datamodules/segments.py"}
+    assert expected <= names
+    strangers = {name.split("/")[0] for name in names} - {"dds_lightning", "datamodules"}
+    assert all(name.endswith(".dist-info") for name in strangers)
+    code = "import dds_lightning; print(dds_lightning.__file__); from dds_lightning.cli import main; main(['tasks'])"
+    ran = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(tmp_path / "site"), "PATH": "/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert str(tmp_path / "site") in ran.stdout
+    assert "pointmaze-large-diverse" in ran.stdout

@@ -1,0 +1,239 @@
+"""Discrete IQL and AWR: on a chain whose values are known, and on hand-made batches."""
+
+import warnings
+
+import lightning.pytorch as pl
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from dds_lightning.errors import UserError
+from dds_lightning.policy import PolicyModule
+
+
+def small(**settings) -> PolicyModule:
+    torch.manual_seed(0)
+    settings = {"hidden_dims": (32, 32), "extraction": "joint"} | settings
+    return PolicyModule(settings.pop("observation_dim", 2), settings.pop("num_skills", 4), **settings)
+
+
+def batch(size: int = 8, dim: int = 2, skills: int = 4) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(1)
+    return {
+        "observations": torch.randn(size, dim, generator=generator),
+        "codes": torch.randint(skills, (size,), generator=generator),
+        "rewards": torch.randn(size, generator=generator),
+        "next_observations": torch.randn(size, dim, generator=generator),
+        "discounts": torch.full((size,), 0.9),
+        "dones": torch.zeros(size),
+    }
+
+
+class Chain(pl.LightningDataModule):
+    """Five states in a row; code 1 steps right, code 0 left; reward 1 on reaching the right end, which ends it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        rows = []
+        for s in range(4):
+            rows.append((s, 1, float(s == 3), s + 1, float(s == 3)))
+            rows.append((s, 0, 0.0, max(s - 1, 0), 0.0))
+        s, k, r, n, d = map(torch.tensor, zip(*rows, strict=True))
+        eye = torch.eye(5)
+        self.data = {
+            "observations": eye[s],
+            "codes": k,
+            "rewards": r,
+            "next_observations": eye[n],
+            "discounts": torch.full((8,), 0.9),
+            "dones": d,
+        }
+
+    def statistics(self):
+        share = torch.tensor([0.5, 0.5, 0.0, 0.0])
+        return {
+            "observation_mean": torch.zeros(5),
+            "observation_std": torch.ones(5),
+            "code_share": share,
+            "reward_range": (0.0, 1.0),
+            "max_discount": 0.9,
+        }
+
+    def train_dataloader(self):
+        return DataLoader([self.data] * 100, batch_size=None)
+
+
+def fit(module: PolicyModule, steps: int, datamodule: pl.LightningDataModule) -> pl.Trainer:
+    trainer = pl.Trainer(
+        max_steps=steps,
+        logger=False,
+        accelerator="cpu",
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        log_every_n_steps=50,
+    )
+    trainer.fit(module, datamodule)
+    return trainer
+
+
+@pytest.fixture(scope="module")
+def trained():
+    chain = Chain()
+    module = small(observation_dim=5, lr=3e-3, target_ema=0.05, tau=0.9, alpha=10.0, critic_steps=900)
+    module.hparams.extraction = "after"
+    fit(module, 1300, chain)
+    return module.eval(), chain
+
+
+def test_values_of_the_chain_are_the_powers_of_the_discount(trained):
+    module, _ = trained
+    with torch.no_grad():
+        v = module.v(torch.eye(5)[:4])
+    # tau = 0.9 between both codes: above their mean, a little under the maximum 0.9^(3 - s).
+    best = torch.tensor([0.729, 0.81, 0.9, 1.0])
+    assert (v < best + 0.02).all()
+    assert (v > best - 0.12).all()
+    assert (v.diff() > 0.03).all()
+
+
+def test_the_policy_steps_right_everywhere_however_it_is_chosen(trained):
+    module, _ = trained
+    states = torch.eye(5)[:4]
+    with torch.no_grad():
+        assert module.codes(states, "greedy").tolist() == [1, 1, 1, 1]
+        assert module.codes(states, "argmax_q").tolist() == [1, 1, 1, 1]
+        many = module.codes(states.repeat(500, 1), "sample", generator=torch.Generator().manual_seed(0))
+    assert (many == 1).float().mean() > 0.75
+    assert many.max() == 1  # codes 2 and 3 are not in the data
+
+
+def test_codes_without_support_are_never_chosen():
+    module = small()
+    module.support_mask.copy_(torch.tensor([True, False, True, False]))
+    states = torch.randn(300, 2)
+    with torch.no_grad():
+        for selection in ("sample", "greedy", "argmax_q"):
+            assert set(module.codes(states, selection).tolist()) <= {0, 2}
+
+
+def test_temperature_goes_from_sampling_to_greedy():
+    module = small()
+    states = torch.randn(400, 2)
+    with torch.no_grad():
+        greedy = module.codes(states, "greedy")
+        cold = module.codes(states, "sample", temperature=1e-3, generator=torch.Generator().manual_seed(0))
+        warm = module.codes(states, "sample", temperature=1.0, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(cold, greedy)
+    assert (warm == greedy).float().mean() < 0.9
+
+
+def test_losses_touch_only_their_own_networks():
+    module = small()
+    data = batch()
+    features = module.embed(data["observations"])
+    v = module.value(features).squeeze(-1)
+    critic_loss, _ = module.critic_loss(features, v, torch.zeros(8), data)
+    critic_loss.backward()
+    assert all(p.grad is not None for p in [*module.value.parameters(), *module.critic.parameters()])
+    assert all(p.grad is None for p in [*module.actor.parameters(), *module.target_critic.parameters()])
+    module.zero_grad()
+    actor_loss, _ = module.actor_loss(features, torch.ones(8), data["codes"])
+    actor_loss.backward()
+    assert all(p.grad is not None for p in module.actor.parameters())
+    assert all(p.grad is None for p in [*module.value.parameters(), *module.critic.parameters()])
+
+
+def test_one_adam_over_the_sum_equals_three_adams():
+    one, three = small(), small()
+    joint = torch.optim.Adam([p for p in one.parameters() if p.requires_grad], lr=1e-3)
+    parts = [torch.optim.Adam(m.parameters(), lr=1e-3) for m in (three.value, three.critic, three.actor)]
+    for _ in range(5):
+        joint.zero_grad()
+        one.loss(batch())[0].backward()
+        joint.step()
+        for optimizer in parts:
+            optimizer.zero_grad()
+        three.loss(batch())[0].backward()
+        for optimizer in parts:
+            optimizer.step()
+    for a, b in zip(one.parameters(), three.parameters(), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_extraction_after_trains_the_critic_first_and_then_leaves_it_alone():
+    class Spy(pl.Callback):
+        def on_train_batch_end(self, trainer, module, *_):
+            if trainer.global_step in (20, 40):
+                states[trainer.global_step] = {k: v.clone() for k, v in module.state_dict().items()}
+
+    states: dict[int, dict[str, torch.Tensor]] = {}
+    module = small(observation_dim=5, extraction="after", critic_steps=20, lr=1e-3)
+    start = {k: v.clone() for k, v in module.state_dict().items()}
+    trainer = pl.Trainer(
+        max_steps=40,
+        logger=False,
+        accelerator="cpu",
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        callbacks=[Spy()],
+    )
+    trainer.fit(module, Chain())
+
+    def moved(a, b, part):
+        return any(not torch.equal(a[k], b[k]) for k in a if k.startswith(part))
+
+    assert moved(start, states[20], "value") and moved(start, states[20], "critic")
+    assert not moved(start, states[20], "actor")
+    assert not moved(states[20], states[40], "value") and not moved(states[20], states[40], "critic")
+    assert moved(states[20], states[40], "actor")
+
+
+def test_target_critic_follows_at_the_polyak_rate():
+    module = small(target_ema=0.25)
+    with torch.no_grad():
+        for p in module.critic.parameters():
+            p.add_(1.0)
+    before = [p.clone() for p in module.target_critic.parameters()]
+    module.on_train_batch_end(None, {}, 0)
+    for b, t, c in zip(before, module.target_critic.parameters(), module.critic.parameters(), strict=True):
+        torch.testing.assert_close(t, 0.75 * b + 0.25 * c)
+
+
+def test_the_watch_warns_of_values_that_no_rewards_can_sum_to():
+    module = small(observation_dim=5)
+    module.fit_statistics(**Chain().statistics())
+    assert module.value_range.tolist() == pytest.approx([0.0, 10.0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        module._watch({"v_min": torch.tensor(0.0), "v_max": torch.tensor(9.9)})
+    with pytest.warns(UserWarning, match="allow only 0 to 10: the critic diverges"):
+        module._watch({"v_min": torch.tensor(0.0), "v_max": torch.tensor(25.0)})
+    with pytest.warns(UserWarning, match="80 % of the AWR weights are clipped"):
+        module._watch(
+            {"v_min": torch.tensor(0.0), "v_max": torch.tensor(1.0), "clipped_share": torch.tensor(0.8)}
+        )
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"num_skills": 1}, "model.num_skills is 1, expected at least 2"),
+        ({"tau": 1.0}, r"model.tau is 1.0, expected in \(0, 1\)"),
+        ({"alpha": -1.0}, "model.alpha is -1.0"),
+        ({"target_ema": 0.0}, "model.target_ema is 0.0"),
+        ({"support": 0.5}, "model.support is 0.5"),
+    ],
+)
+def test_settings_out_of_range_are_refused_by_name(settings, message):
+    with pytest.raises(UserError, match=message):
+        small(**settings)
+
+
+def test_fourier_features_and_layer_norm_keep_the_shapes():
+    module = small(fourier_features=8, layer_norm=True)
+    states = torch.randn(3, 2)
+    assert module.v(states).shape == (3,)
+    assert module.q(states).shape == (3, 4)
+    assert module.logits(states).shape == (3, 4)
