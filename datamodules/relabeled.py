@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from datamodules.relabel import Discount, Relabelled, relabel, relabel_key
-from datamodules.segments import TensorLoader, split_episodes
+from datamodules.segments import TensorLoader
 from datamodules.sources import load_trajectories
 from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError
@@ -131,7 +131,7 @@ class RelabeledDataModule(pl.LightningDataModule):
         path = Path(self.hparams.relabelled) if self.hparams.relabelled else self.cache_file()
         self.transitions = Relabelled.load(path, key)
         h = self.hparams
-        _, held_out = split_episodes(self.trajectories, h.validation_fraction, h.seed, self.skill.horizon)
+        _, held_out = self.trajectories.split(h.validation_fraction, h.seed, self.skill.horizon)
         kept = torch.isin(self.transitions.episodes, torch.as_tensor(held_out))
         self.train_index, self.validation_index = torch.nonzero(~kept).flatten(), torch.nonzero(kept).flatten()
 

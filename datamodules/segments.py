@@ -27,9 +27,10 @@ zero."""
 class TensorLoader:
     """Batches by index, in an order that is a function of (seed, epoch).
 
-    A new iteration is a new epoch, whether or not the last one was finished. After `load_state_dict` the next
-    iteration goes on after the last batch that was handed out, or starts the next epoch if that was the last
-    one. Lightning saves and restores this state by itself. There are no workers: indexing is cheaper than a
+    Shuffled batches are an endless stream of epochs, each a new permutation; an iteration hands out the next
+    `len(self)` of them, so one that was left early is taken up where it stopped. Without shuffling every
+    iteration begins at the first item. `state_dict` and `load_state_dict` hold the place in the stream, to
+    the batch; Lightning saves and restores them by itself. There are no workers: indexing is cheaper than a
     message.
     """
 
@@ -52,7 +53,7 @@ class TensorLoader:
             gather: (B,) int64 indices on `device` -> a batch.
             size: Number of items; indices run from 0 to size - 1.
             batch_size: B; no larger than `size`.
-            shuffle: Permute at every epoch; else the order is 0, 1, 2, ...
+            shuffle: Permute at every epoch; else the order is always 0, 1, 2, ...
             seed: Of the permutations.
             drop_last: Leave out a last batch that is not full.
             rank: Number of this process; it takes every `world_size`-th item.
@@ -70,7 +71,7 @@ class TensorLoader:
         self._share = size // world_size
         self.batch_size = min(batch_size, self._share)
         self.drop_last = drop_last
-        self._epoch, self._batch, self._resuming = -1, 0, False
+        self._epoch, self._batch, self._resuming = 0, 0, False
 
     def __len__(self) -> int:
         """Batches of an epoch."""
@@ -86,17 +87,25 @@ class TensorLoader:
         return torch.randperm(self.size, generator=generator)
 
     def __iter__(self) -> Iterator[Batch]:
-        """Batches of the next epoch, or the rest of the one that was restored."""
-        # All of this runs at the first `next`, and nothing after the last `yield` matters: Lightning makes
-        # iterators that it never starts, and does not exhaust those that it does.
-        if not (self._resuming and self._epoch >= 0 and self._batch < len(self)):
-            self._epoch, self._batch = self._epoch + 1, 0
+        """The next `len(self)` batches of the stream, or, without shuffling, those of an epoch from its "
+        "start."""
+        # All of this runs at the first `next`: Lightning makes iterators that it never starts. Nothing after
+        # the last `yield` matters: it does not exhaust those that it does start.
+        if not self.shuffle and not self._resuming:
+            self._epoch, self._batch = 0, 0
+        count = len(self) if self.shuffle else len(self) - self._batch
         self._resuming = False
-        order = self.order(self._epoch)[self.rank :: self.world_size][: self._share].to(self.device)
-        while self._batch < len(self):
+        order = self._share_of(self._epoch)
+        for _ in range(count):
+            if self._batch >= len(self):
+                self._epoch, self._batch = self._epoch + 1, 0
+                order = self._share_of(self._epoch)
             start = self._batch * self.batch_size
             self._batch += 1
             yield self.gather(order[start : start + self.batch_size])
+
+    def _share_of(self, epoch: int) -> Tensor:
+        return self.order(epoch)[self.rank :: self.world_size][: self._share].to(self.device)
 
     def state_dict(self) -> dict[str, int]:
         """Epoch, batches handed out, and what the order depends on."""

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 class Actor(Protocol):
     """An agent, a controller, a baseline.
 
-    An actor that has skills also has `codes`, (E,) int64 code in use, and `decided`, (E,) bool whether the last
-    act chose it anew.
+    An actor that has skills also has `codes`, (E,) int64 code in use, and `decided`, (E,) bool whether the
+    last act chose it anew.
     """
 
     def reset(self, num_envs: int, seed: int | None = None) -> None:
@@ -67,8 +67,8 @@ class RandomActor:
 class AgentGroup:
     """Agents on one skill model as one actor: each chooses its own codes, one decoder batch acts for all.
 
-    Rows are the agents' environments, one agent after the other. A small decoder batch costs almost as much as a
-    large one, so this is what makes a table of many contestants cheap.
+    Rows are the agents' environments, one agent after the other. A small decoder batch costs almost as much
+    as a large one, so this is what makes a table of many contestants cheap.
 
     Args:
         agents: with equal `group_key`, no agent twice.

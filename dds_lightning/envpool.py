@@ -8,8 +8,8 @@
 
 A slot plays a fixed list of seeds one after the other, so short episodes are never over-counted; a slot
 whose list is done is neither stepped nor acted upon. Workers are plain `python -c` children: they work from
-notebooks, from scripts without a `__main__` guard and under pytest, import no torch, and end when their caller
-does, because their input ends.
+notebooks, from scripts without a `__main__` guard and under pytest, import no torch, and end when their
+caller does, because their input ends.
 """
 
 from __future__ import annotations

@@ -6,7 +6,6 @@ Imports neither torch nor Lightning, so a worker starts in about a second and st
 from __future__ import annotations
 
 import contextlib
-import io
 import os
 import pickle
 import signal
@@ -27,9 +26,10 @@ _HEADER = struct.Struct("<cQ")
 def record_dtype(task: Task) -> np.dtype[Any]:
     """One slot's answer to one step.
 
-    Fields: `observation` (O,) to act on next; `reached` (O,) where the action led (they differ when an episode
-    ended and the next began); `position` and `reached_position` (2,) likewise, NaN where there is no maze;
-    `reward`, `terminated`, `truncated`; `success` of the state reached; `alive`, whether there is more to act on.
+    Fields: `observation` (O,) to act on next; `reached` (O,) where the action led (they differ when an
+    episode ended and the next began); `position` and `reached_position` (2,) likewise, NaN where there is no
+    maze; `reward`, `terminated`, `truncated`; `success` of the state reached; `alive`, whether there is more
+    to act on.
     """
     width = (task.observation_dim,)
     return np.dtype(
@@ -155,8 +155,7 @@ def worker_main() -> None:
         try:
             if kind == b"I":
                 task, count = pickle.loads(payload)  # written by our own caller, through a private pipe
-                with contextlib.redirect_stderr(io.StringIO()):  # greetings of libraries, once a worker
-                    slots = Slots(task, count)
+                slots = Slots(task, count)
                 answer = b""
             else:
                 assert slots is not None

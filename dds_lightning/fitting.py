@@ -18,21 +18,27 @@ import torch
 from jsonargparse import Namespace
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
-from datamodules.relabeled import RelabeledDataModule
-from datamodules.segments import SegmentDataModule
 from dds_lightning import interrupts
 from dds_lightning.configs import resolve_configs
 from dds_lightning.errors import UserError
-from dds_lightning.policy import PolicyModule
 from dds_lightning.reports import Report, table
-from dds_lightning.skill import SkillModule
 from dds_lightning.training import BestCheckpoint, RollingCheckpoint, trainer_settings
 
-MODULES: dict[str, tuple[type[pl.LightningModule], type[pl.LightningDataModule]]] = {
-    "skill": (SkillModule, SegmentDataModule),
-    "policy": (PolicyModule, RelabeledDataModule),
-}
+STEPS = {"skill": 500_000, "policy": 1_500_000}  # the paper's, as are the defaults of the modules
 LINKS = {"skill": ("observation_dim", "action_dim", "horizon"), "policy": ("observation_dim", "num_skills")}
+
+
+def modules(stage: str) -> tuple[type[pl.LightningModule], type[pl.LightningDataModule]]:
+    """The model and the data of a stage."""
+    if stage == "skill":
+        from datamodules.segments import SegmentDataModule
+        from dds_lightning.skill import SkillModule
+
+        return SkillModule, SegmentDataModule
+    from datamodules.relabeled import RelabeledDataModule
+    from dds_lightning.policy import PolicyModule
+
+    return PolicyModule, RelabeledDataModule
 
 
 class StageCLI(LightningCLI):
@@ -51,14 +57,18 @@ class StageCLI(LightningCLI):
         self.checkpoint: dict[str, Any] | None = None
         self.result: Report | None = None
         parser = {"exit_on_error": False}
-        module, datamodule = MODULES[stage]
+        module, datamodule = modules(stage)
         super().__init__(
             module,
             datamodule,
             args=self.words,
             save_config_kwargs={"overwrite": True},
             seed_everything_default=0,
-            trainer_defaults={"default_root_dir": f"runs/{stage}", "max_epochs": -1},
+            trainer_defaults={
+                "default_root_dir": f"runs/{stage}",
+                "max_epochs": -1,
+                "max_steps": STEPS[stage],
+            },
             parser_kwargs={"prog": f"dds {stage}", **parser, **dict.fromkeys(self.subcommands(), parser)},
             auto_configure_optimizers=False,
             load_from_checkpoint_support=False,  # our checkpoints name no class to import
@@ -74,6 +84,11 @@ class StageCLI(LightningCLI):
         parser.add_argument("--json", action="store_true", help="print one JSON document and nothing else")
         for name in LINKS[self.stage]:
             parser.link_arguments(f"data.{name}", f"model.{name}", apply_on="instantiate")
+
+    @staticmethod
+    def subcommands() -> dict[str, set[str]]:
+        """Lightning's, without `weights_only`: ours is always true, so that no checkpoint can run code."""
+        return {name: {*skip, "weights_only"} for name, skip in LightningCLI.subcommands().items()}
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
         """Parse the words given to us and never those of the process."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from dds_lightning.errors import UserError
+from dds_lightning.files import written_whole
 
 _EPISODES, _PATHS = "episodes.parquet", "paths.npz"
 
@@ -43,10 +43,10 @@ class RolloutResult:
     Attributes:
         task: name of the task.
         episodes: one row an episode: `actor`, `label` (the part of the contestant, else its name), `episode`
-            (counted within the contestant), `seed` (of the environment), `return` (environment's own rewards),
-            `score` (normalised, 0 to 100), `success`, `terminated`, `length` (steps), `final_x` and `final_y`
-            (metres; NaN where there is no maze), `final_code` (skill in use at the end; -1 without skills),
-            `codes` (list of the skills chosen, one a decision).
+            (counted within the contestant), `seed` (of the environment), `return` (environment's own
+            rewards), `score` (normalised, 0 to 100), `success`, `terminated`, `length` (steps), `final_x` and
+            `final_y` (metres; NaN where there is no maze), `final_code` (skill in use at the end; -1 without
+            skills), `codes` (list of the skills chosen, one a decision).
         paths: (actor, episode) to `RolloutPath`; empty unless recorded.
     """
 
@@ -57,8 +57,8 @@ class RolloutResult:
     def summary(self, by: str = "actor") -> pd.DataFrame:
         """One row for each `actor` or `label`, in the table's order.
 
-        Columns: `episodes`, `success` (per cent), `score` (mean), `score_error` (its standard error), `return`,
-        `length` (means), `length_success` (mean steps of the successful episodes; NaN if none).
+        Columns: `episodes`, `success` (per cent), `score` (mean), `score_error` (its standard error),
+        `return`, `length` (means), `length_success` (mean steps of the successful episodes; NaN if none).
         """
         rows = []
         for name, part in self.episodes.groupby(by, sort=False):
@@ -84,7 +84,8 @@ class RolloutResult:
         directory.mkdir(parents=True, exist_ok=True)
         table = self.episodes.copy()
         table.attrs = {"task": self.task}
-        _replace(directory / _EPISODES, lambda path: table.to_parquet(path, index=False))
+        with written_whole(directory / _EPISODES) as part:
+            table.to_parquet(part, index=False)
         if self.paths:
             keys = list(zip(table["actor"], table["episode"], strict=True))
             recorded = [self.paths[key] for key in keys]
@@ -94,7 +95,8 @@ class RolloutResult:
             }
             if recorded[0].observations is not None:
                 arrays["observations"] = np.concatenate([path.observations for path in recorded])
-            _replace(directory / _PATHS, lambda path: _savez(path, arrays))
+            with written_whole(directory / _PATHS) as part, part.open("wb") as file:
+                np.savez_compressed(file, allow_pickle=False, **arrays)
         else:
             (directory / _PATHS).unlink(missing_ok=True)  # of an earlier rollout
         return directory
@@ -129,20 +131,3 @@ class RolloutResult:
                 paths[actor, int(episode)] = RolloutPath(arrays["positions"][states], codes, seen)
                 step, state = step + length, state + length + 1
         return cls(str(table.attrs.get("task", "")), table, paths)
-
-
-def _savez(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
-    with path.open("wb") as file:  # given a name, numpy would append .npz to it
-        np.savez_compressed(file, allow_pickle=False, **arrays)
-
-
-def _replace(path: Path, write: Any) -> None:
-    """Write beside `path`, then put it in place."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        write(part)
-        with part.open("rb+") as file:
-            os.fsync(file.fileno())
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)

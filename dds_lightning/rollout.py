@@ -1,8 +1,8 @@
 """Vectorised episodes of several contestants over real environments, and one result row an episode.
 
-Contestants play side by side in one `EnvPool`. Each has slots of its own and a fixed split of its episodes over
-them, so an actor that fails slowly is counted as often as one that succeeds fast. Episode i of every contestant
-starts from the same environment seed: comparisons are paired.
+Contestants play side by side in one `EnvPool`. Each has slots of its own and a fixed split of its episodes
+over them, so an episode that fails slowly counts as much as one that succeeds fast. Episode i of every
+contestant starts from the same environment seed: comparisons are paired.
 
 The same call gives the same table: results depend on task, contestants, `seed` and `slots`, not on `workers`.
 (They depend on `slots` because the rows of one batch share the actor's random stream.)
@@ -39,7 +39,7 @@ class Contestant:
         name: shown in the table; unique within a rollout.
         actor: acts; see `dds_lightning.actors.Actor`.
         episodes: how many.
-        labels: one a episode, for a contestant of several parts (each single skill). With L different labels,
+        labels: one an episode, for a contestant of several parts (each single skill). With L different labels,
             row r of the actor plays only episodes of label number r modulo L, in order of first appearance.
     """
 

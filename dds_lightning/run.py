@@ -166,7 +166,7 @@ class Run:
             )
             spec = f"local:{made['data']}"
         facts = check_dataset(spec, self.task)
-        return {**made, "facts": dict(zip(facts["fact"], map(str, facts["value"]), strict=True))}
+        return {**made, "facts": facts}
 
     def _words(self, stage: str, spec: str) -> list[str]:
         """The words of `dds STAGE fit` for this run."""

@@ -14,7 +14,9 @@ from dds_lightning.environments import build_env
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import get_task, known_env_ids, task_names, task_table
 
-POINTMAZES = [f"pointmaze-{size}-{recipe}" for size in ("umaze", "medium", "large") for recipe in ("play", "diverse")]
+POINTMAZES = [
+    f"pointmaze-{size}-{recipe}" for size in ("umaze", "medium", "large") for recipe in ("play", "diverse")
+]
 
 
 def test_the_table_has_the_six_pointmazes() -> None:

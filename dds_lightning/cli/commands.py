@@ -4,13 +4,10 @@ Heavy imports stay inside the functions, so that `dds tasks` need not wait for t
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from dds_lightning.errors import UserError
 from dds_lightning.reports import Report, table
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 
 def run(
@@ -227,13 +224,13 @@ def data_check(data: str, task: str | None = None, horizon: int | None = None) -
 
     facts = check_dataset(_spec(data), task, horizon=horizon)
     return Report(
-        {"data": _spec(data), "task": task, "sound": True, "facts": _facts(facts)},
-        [table(facts), f"{_spec(data)} is sound" + (f" and fits {task}" if task else "")],
+        {"data": _spec(data), "task": task, "sound": True, "facts": facts},
+        [_facts(facts), f"{_spec(data)} is sound" + (f" and fits {task}" if task else "")],
     )
 
 
-def data_show(data: str, task: str | None = None, episodes: int = 20) -> Report:
-    """Show what is in a data set and its longest episodes.
+def data_show(data: str, task: str | None = None, episodes: int = 10) -> Report:
+    """Show what is in a data set: the range of every dimension, and its longest episodes.
 
     Args:
         data: local:DIR, minari:ID or a folder
@@ -246,11 +243,11 @@ def data_show(data: str, task: str | None = None, episodes: int = 20) -> Report:
 
     chosen = get_task(task) if task else None
     trajectories = load_trajectories(_spec(data), chosen)
-    facts = describe(trajectories, task=chosen)
+    facts, dimensions = describe(trajectories, task=chosen)
     rows = episode_table(trajectories).sort_values("steps", ascending=False, kind="stable").head(episodes)
     return Report(
-        {"data": _spec(data), "task": task, "facts": _facts(facts), "episodes": rows},
-        [table(facts), table(rows, f"the {len(rows)} longest episodes")],
+        {"data": _spec(data), "task": task, "facts": facts, "dimensions": dimensions, "episodes": rows},
+        [_facts(facts), table(dimensions), table(rows, f"the {len(rows)} longest episodes")],
     )
 
 
@@ -260,12 +257,9 @@ def data_list(root: list[str] = ["data"]) -> Report:  # noqa: B006
     Args:
         root: folders to look in beside MINARI_DATASETS_PATH (or ~/.minari/datasets)
     """
-    import pandas as pd
+    from datamodules.inspection import find_datasets
 
-    from datamodules.inspection import list_datasets
-
-    looked: list[str | None] = [None, *(folder for folder in root if Path(folder).is_dir())]
-    found = pd.concat([list_datasets(folder) for folder in looked], ignore_index=True)
+    found = find_datasets(root)
     if found.empty:
         where = ", ".join(["Minari's folder", *root])
         return Report(found, [f"no data sets in {where}; make one with `dds data collect TASK`"])
@@ -289,6 +283,6 @@ def _spec(data: str) -> str:
     return data
 
 
-def _facts(frame: "pd.DataFrame") -> dict[str, object]:
-    """The rows of a table of facts as one mapping."""
-    return dict(zip(frame["fact"], frame["value"], strict=True))
+def _facts(facts: dict[str, object]) -> str:
+    width = max(map(len, facts), default=0)
+    return "\n".join(f"{name:<{width}}  {value}" for name, value in facts.items())

@@ -43,7 +43,9 @@ def _walk(places: str, *, terminated: bool = False) -> dict[str, Any]:
         ("OIIOOIOO", [(0, 1, True), (3, 5, True), (6, 7, False)]),
     ],
 )
-def test_episodes_are_cut_where_the_goal_is_reached(places: str, expected: list[tuple[int, int, bool]]) -> None:
+def test_episodes_are_cut_where_the_goal_is_reached(
+    places: str, expected: list[tuple[int, int, bool]]
+) -> None:
     data = relabel_to_goal(Trajectories.from_episodes("walk", [_walk(places)]), TASK)
     found = []
     for e in range(data.num_episodes):
@@ -53,7 +55,9 @@ def test_episodes_are_cut_where_the_goal_is_reached(places: str, expected: list[
         np.testing.assert_allclose(episode["actions"][:, 0], states[:-1] / 10, rtol=1e-6)
         reached = bool(episode["terminations"][-1])
         assert bool(episode["truncations"][-1]) is not reached
-        np.testing.assert_array_equal(episode["rewards"], (np.arange(len(states) - 1) == len(states) - 2) & reached)
+        np.testing.assert_array_equal(
+            episode["rewards"], (np.arange(len(states) - 1) == len(states) - 2) & reached
+        )
         found.append((states[0], states[-1], reached))
     assert found == expected
 

@@ -19,7 +19,9 @@ LARGE = "pointmaze-large-diverse"
 
 
 def _spec(**entries: Any) -> str:
-    return json.dumps({"id": "PointMaze_Large-v3", "entry_point": "gymnasium_robotics:PointMazeEnv", **entries})
+    return json.dumps(
+        {"id": "PointMaze_Large-v3", "entry_point": "gymnasium_robotics:PointMazeEnv", **entries}
+    )
 
 
 def test_a_sound_set_is_read(minari_set: Write) -> None:
@@ -44,14 +46,17 @@ def test_by_id_from_minaris_folder(minari_set: Write, monkeypatch: pytest.Monkey
 
 @pytest.mark.parametrize("spec", ["", "local", "local:", "http://somewhere", "nowhere:x"])
 def test_an_unknown_source_lists_those_there_are(spec: str) -> None:
-    with pytest.raises(UserError, match=r"data: found '.*', expected one of local:..., minari:..., arrays:..."):
+    with pytest.raises(
+        UserError, match=r"data: found '.*', expected one of local:..., minari:..., arrays:..."
+    ):
         load_trajectories(spec, LARGE)
 
 
 def test_a_set_of_another_task_is_refused_naming_both(minari_set: Write) -> None:
     folder = minari_set(task="pointmaze-medium-play")
     with pytest.raises(
-        DataError, match=r"'set-v0' was recorded in PointMaze_Medium-v3, but task 'pointmaze-large-diverse' needs"
+        DataError,
+        match=r"'set-v0' was recorded in PointMaze_Medium-v3, but task 'pointmaze-large-diverse' needs",
     ):
         load_trajectories(f"local:{folder}", LARGE)
 
@@ -75,19 +80,36 @@ HOSTILE = {
     "no action space": ({"action_space": None}, "has no action_space; Minari would run"),
     "damaged space": ({"action_space": "{"}, "action_space in metadata.json is damaged"),
     "unbounded actions": (
-        {"action_space": json.dumps({"type": "Box", "shape": [2], "low": [-1, -1], "high": [1, float("inf")]})},
+        {
+            "action_space": json.dumps(
+                {"type": "Box", "shape": [2], "low": [-1, -1], "high": [1, float("inf")]}
+            )
+        },
         "expected a bounded Box",
     ),
-    "discrete actions": ({"action_space": json.dumps({"type": "Discrete", "n": 3})}, "expected a bounded Box"),
+    "discrete actions": (
+        {"action_space": json.dumps({"type": "Discrete", "n": 3})},
+        "expected a bounded Box",
+    ),
     "foreign code": ({"env_spec": _spec(entry_point="os:system")}, "names the code 'os:system'"),
-    "look-alike package": ({"env_spec": _spec(entry_point="gymnasium_evil:Env")}, "names the code 'gymnasium_evil"),
+    "look-alike package": (
+        {"env_spec": _spec(entry_point="gymnasium_evil:Env")},
+        "names the code 'gymnasium_evil",
+    ),
     "foreign wrapper": (
-        {"env_spec": _spec(additional_wrappers=[{"name": "w", "entry_point": "shutil:rmtree", "kwargs": {}}])},
+        {
+            "env_spec": _spec(
+                additional_wrappers=[{"name": "w", "entry_point": "shutil:rmtree", "kwargs": {}}]
+            )
+        },
         "names the code 'shutil:rmtree'",
     ),
     "unknown environment": ({"env_spec": _spec(id="Evil-v0")}, "recorded in 'Evil-v0', which no task uses"),
     "damaged environment": ({"env_spec": "[]"}, "env_spec in metadata.json is damaged"),
-    "no environment": ({"env_spec": None}, "has no env_spec, so nothing says that it was recorded in PointMaze_"),
+    "no environment": (
+        {"env_spec": None},
+        "has no env_spec, so nothing says that it was recorded in PointMaze_",
+    ),
     "other format": ({"data_format": "arrow"}, "data_format is 'arrow', expected 'hdf5'"),
     "episodes hidden": ({"total_episodes": 1}, "promises 1 episodes, but .* holds 2"),
     "episodes invented": ({"total_episodes": 10**12}, "promises 1000000000000 episodes, but .* holds 2"),
@@ -99,7 +121,9 @@ HOSTILE = {
 def test_metadata_are_not_trusted(case: str, minari_set: Write, monkeypatch: pytest.MonkeyPatch) -> None:
     import gymnasium
 
-    monkeypatch.setattr(gymnasium, "make", lambda *a, **k: pytest.fail("an environment was built from a data set"))
+    monkeypatch.setattr(
+        gymnasium, "make", lambda *a, **k: pytest.fail("an environment was built from a data set")
+    )
     metadata, message = HOSTILE[case]
     with pytest.raises(DataError, match=message):
         load_trajectories(f"local:{minari_set(metadata=metadata)}", LARGE)
@@ -141,7 +165,10 @@ SPOILT: dict[str, tuple[Callable[[h5py.File], None], str]] = {
         _delete("episode_1/observations/observation"),
         "episode_1, observations: found the entries desired_goal, expected 'observation'",
     ),
-    "an array for an episode": (_set("episode_1", np.zeros(3)), "episode_1: found an array, expected a group"),
+    "an array for an episode": (
+        _set("episode_1", np.zeros(3)),
+        "episode_1: found an array, expected a group",
+    ),
     "a gap": (_delete("episode_0"), "promises 2 episodes, but .* holds 1"),
     "a link": (
         _set("episode_1/rewards", h5py.ExternalLink("elsewhere.hdf5", "/x")),

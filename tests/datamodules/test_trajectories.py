@@ -29,7 +29,9 @@ def test_layout_is_flat_with_one_more_observation_an_episode(three: Trajectories
     np.testing.assert_array_equal(three.terminations.nonzero()[0], [7])
     np.testing.assert_array_equal(three.truncations.nonzero()[0], [4, 11])
     np.testing.assert_array_equal(three.returns, [10, 3, 6])
-    assert {array.dtype for array in (three.observations, three.actions, three.rewards)} == {np.dtype("float32")}
+    assert {array.dtype for array in (three.observations, three.actions, three.rewards)} == {
+        np.dtype("float32")
+    }
 
 
 def test_an_episode_comes_back_as_it_went_in(three: Trajectories, make_episode: Make) -> None:

@@ -34,7 +34,10 @@ FAULTS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
         r"observations: found nan at step 3, column 1, expected finite",
     ),
     "infinite action": (_put("actions", (2, 0), -np.inf), r"actions: found -inf at step 2, column 0"),
-    "reward too large for 32 bits": (_put("rewards", 4, 1e300), r"rewards: found 1e\+300 at step 4, expected"),
+    "reward too large for 32 bits": (
+        _put("rewards", 4, 1e300),
+        r"rewards: found 1e\+300 at step 4, expected",
+    ),
     "action outside the box": (
         _put("actions", (1, 0), 1.25),
         r"actions: found 1.25 at step 1, column 0, expected -1 to 1",
@@ -65,7 +68,10 @@ FAULTS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
         _replace("terminations", lambda a: a[1:]),
         r"terminations: found 5 rows, but rewards has 6",
     ),
-    "no end": (_replace("truncations", lambda a: a & False), r"never ends: terminations and truncations are both"),
+    "no end": (
+        _replace("truncations", lambda a: a & False),
+        r"never ends: terminations and truncations are both",
+    ),
     "a flag inside": (
         _put("truncations", 2, True),
         r"truncations: found True at step 2, inside an episode of 6 steps",
@@ -135,5 +141,7 @@ def test_flags_of_0_and_1_are_flags(make_episode: Make) -> None:
 def test_the_first_widths_hold_for_all(make_episode: Make) -> None:
     other = make_episode(5)
     other["observations"] = np.zeros((6, 3))
-    with pytest.raises(DataError, match=r"episode 1, observations: found shape \(6, 3\), expected \(steps, 2\)"):
+    with pytest.raises(
+        DataError, match=r"episode 1, observations: found shape \(6, 3\), expected \(steps, 2\)"
+    ):
         Trajectories.from_episodes("mixed", [make_episode(5), other])

@@ -1,0 +1,209 @@
+"""Relabelling: rewards and ends worked out by hand, the cache refused when it does not match."""
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from datamodules.relabel import Relabelled, relabel, relabel_key
+from datamodules.relabeled import RelabeledDataModule
+from datamodules.trajectories import Trajectories
+from dds_lightning.errors import UserError
+from dds_lightning.skill import SkillModule
+
+SMALL = {"hidden_dim": 16, "encoder_layers": 1, "encoder_heads": 2, "decoder_blocks": 1, "skill_dim": 8}
+
+
+def episode(steps: int, end: str, first: float = 0.0) -> dict[str, np.ndarray]:
+    """Observation t is (first + t, t); reward of step t is t + 1."""
+    t = np.arange(steps + 1, dtype=np.float32)
+    flags = np.arange(steps) == steps - 1
+    return {
+        "observations": np.stack([first + t, t], axis=1),
+        "actions": np.linspace(-1, 1, steps, dtype=np.float32)[:, None],
+        "rewards": np.arange(1, steps + 1, dtype=np.float32),
+        "terminations": flags if end == "terminated" else np.zeros(steps, bool),
+        "truncations": flags if end == "truncated" else np.zeros(steps, bool),
+    }
+
+
+@pytest.fixture
+def trajectories():
+    return Trajectories.from_episodes(
+        "toy", [episode(5, "terminated"), episode(5, "truncated", 100.0), episode(2, "terminated", 200.0)]
+    )
+
+
+@pytest.fixture
+def skill():
+    torch.manual_seed(0)
+    return SkillModule(2, 1, horizon=3, num_skills=4, **SMALL).eval()
+
+
+def test_every_end_of_an_episode(trajectories, skill):
+    """H = 3. Terminated after 5: starts 0..4, the last two cut short. Truncated after 5: starts 0..2. 2 steps: both."""
+    made = relabel(trajectories, skill, gamma=0.5)
+    assert made.observations[:, 0].tolist() == [0, 1, 2, 3, 4, 100, 101, 102, 200, 201]
+    assert made.next_observations[:, 0].tolist() == [3, 4, 5, 5, 5, 103, 104, 105, 202, 202]
+    assert made.dones.tolist() == [0, 0, 1, 1, 1, 0, 0, 0, 1, 1]
+    # 1 + 2/2 + 3/4, 2 + 3/2 + 4/4, 3 + 4/2 + 5/4, then 4 + 5/2 and 5 at the end of the episode.
+    first = [2.75, 4.5, 6.25, 6.5, 5.0]
+    assert made.rewards.tolist() == pytest.approx([*first, 2.75, 4.5, 6.25, 2.0, 2.0])
+    assert made.discounts.tolist() == [0.5] * 10
+    assert made.episodes.tolist() == [0] * 5 + [1] * 3 + [2] * 2
+    assert made.starts.tolist() == [0, 1, 2, 3, 4, 5, 6, 7, 10, 11]
+
+
+def test_discount_per_step_counts_the_steps_really_taken(trajectories, skill):
+    made = relabel(trajectories, skill, gamma=0.5, discount="per_step")
+    assert made.discounts.tolist() == pytest.approx([0.125, 0.125, 0.125, 0.25, 0.5, 0.125, 0.125, 0.125, 0.25, 0.5])
+
+
+def test_the_learning_reward_is_shifted_then_scaled(trajectories, skill):
+    made = relabel(trajectories, skill, gamma=1.0, reward_scale=0.1, reward_shift=-1.0)
+    assert made.rewards[:2].tolist() == pytest.approx([0.1 * (0 + 1 + 2), 0.1 * (1 + 2 + 3)])
+
+
+def test_stride_divides_episodes(trajectories, skill):
+    made = relabel(trajectories, skill, stride=3)
+    assert made.starts.tolist() == [0, 3, 5, 10]
+
+
+def test_codes_are_those_of_the_encoder_whatever_the_batch(trajectories, skill):
+    made = relabel(trajectories, skill, batch_size=3)
+    assert torch.equal(made.codes, relabel(trajectories, skill, batch_size=100).codes)
+    observations = torch.as_tensor(trajectories.observations[1:4])[None]
+    actions = torch.as_tensor(trajectories.actions[1:4])[None]
+    with torch.no_grad():
+        assert made.codes[1] == skill.encode(observations, actions)[0]
+
+
+def test_summary_is_one_row_a_code(trajectories, skill):
+    made = relabel(trajectories, skill, gamma=1.0)
+    table = made.summary()
+    assert table["code"].tolist() == [0, 1, 2, 3]
+    assert table["segments"].sum() == 10
+    assert table["share"].sum() == pytest.approx(1.0)
+    assert table["terminations"].sum() == 5
+    used = table[table["segments"] > 0]
+    codes = made.codes.numpy()
+    for row in used.itertuples():
+        assert row.reward == pytest.approx(made.rewards.numpy()[codes == row.code].mean())
+    assert isinstance(table, pd.DataFrame)
+
+
+def test_saved_and_read_back_is_the_same(trajectories, skill, tmp_path):
+    made = relabel(trajectories, skill)
+    key = relabel_key(
+        trajectories, skill, gamma=0.99, discount="per_skill", stride=1, reward_scale=1.0, reward_shift=0.0
+    )
+    path = tmp_path / "new" / "r.safetensors"
+    made.save(path, key)
+    assert [p.name for p in path.parent.iterdir()] == ["r.safetensors"]
+    back = Relabelled.load(path, key)
+    for name in ("observations", "codes", "rewards", "next_observations", "discounts", "dones", "starts"):
+        assert torch.equal(getattr(back, name), getattr(made, name))
+    with pytest.raises(UserError, match="other inputs .gamma 0.99 instead of 0.9"):
+        Relabelled.load(path, key | {"gamma": 0.9})
+
+
+@pytest.mark.parametrize("content", [b"", b"not a tensor", b"\xff" * 64])
+def test_a_file_that_is_something_else_is_refused(tmp_path, content):
+    path = tmp_path / "r.safetensors"
+    path.write_bytes(content)
+    with pytest.raises(UserError, match="no readable relabelled file"):
+        Relabelled.load(path)
+
+
+def test_a_missing_file_says_how_to_make_one(tmp_path):
+    with pytest.raises(UserError, match="dds relabel"):
+        Relabelled.load(tmp_path / "none.safetensors")
+
+
+def test_a_checkpoint_of_other_dimensions_is_refused(trajectories):
+    with pytest.raises(UserError, match="skill checkpoint has observation_dim 5, data set 'toy' has 2"):
+        relabel(trajectories, SkillModule(5, 1, horizon=3, **SMALL))
+
+
+@pytest.mark.parametrize("gamma", [0.0, 1.5])
+def test_gamma_out_of_range_is_refused(trajectories, skill, gamma):
+    with pytest.raises(UserError, match=f"gamma is {gamma}"):
+        relabel(trajectories, skill, gamma=gamma)
+
+
+def checkpoint(skill: SkillModule, path) -> str:
+    """A Lightning checkpoint without a trainer."""
+    torch.save(
+        {
+            "state_dict": skill.state_dict(),
+            "hyper_parameters": dict(skill.hparams),
+            "pytorch-lightning_version": "2.6.6",
+        },
+        path,
+    )
+    return str(path)
+
+
+def module(trajectories, skill, folder, **settings) -> RelabeledDataModule:
+    return RelabeledDataModule.from_trajectories(
+        trajectories, checkpoint(skill, folder / "skill.ckpt"), validation_fraction=0.3, batch_size=4, **settings
+    )
+
+
+def test_the_data_module_relabels_once_and_splits_by_episode(trajectories, skill, tmp_path):
+    first = module(trajectories, skill, tmp_path)
+    assert (first.observation_dim, first.num_skills) == (2, 4)
+    first.prepare_data()
+    (cached,) = tmp_path.glob("relabelled-*.safetensors")
+    written = cached.stat().st_mtime_ns
+    first.setup()
+    train = set(first.transitions.episodes[first.train_index].tolist())
+    validation = set(first.transitions.episodes[first.validation_index].tolist())
+    assert train | validation == {0, 1, 2}
+    assert not train & validation
+    again = module(trajectories, skill, tmp_path)
+    again.prepare_data()
+    assert cached.stat().st_mtime_ns == written
+    batch = next(iter(again.train_dataloader())) if again.setup() is None else {}
+    assert {name: tuple(value.shape) for name, value in batch.items()} == {
+        "observations": (4, 2),
+        "codes": (4,),
+        "rewards": (4,),
+        "next_observations": (4, 2),
+        "discounts": (4,),
+        "dones": (4,),
+    }
+
+
+def test_other_skills_or_settings_never_read_a_stale_cache(trajectories, skill, tmp_path):
+    files = {module(trajectories, skill, tmp_path).cache_file()}
+    files.add(module(trajectories, skill, tmp_path, gamma=0.9).cache_file())
+    files.add(module(trajectories, skill, tmp_path, stride=2).cache_file())
+    files.add(module(trajectories, skill, tmp_path, reward_shift=-1.0).cache_file())
+    torch.manual_seed(1)
+    other = SkillModule(2, 1, horizon=3, num_skills=4, **SMALL)
+    files.add(module(trajectories, other, tmp_path).cache_file())
+    assert len(files) == 5
+
+
+def test_a_relabelled_file_of_another_checkpoint_is_refused(trajectories, skill, tmp_path):
+    first = module(trajectories, skill, tmp_path)
+    first.prepare_data()
+    torch.manual_seed(1)
+    other = SkillModule(2, 1, horizon=3, num_skills=4, **SMALL)
+    wrong = module(trajectories, other, tmp_path, relabelled=str(first.cache_file()))
+    with pytest.raises(UserError, match="relabelled with other inputs .skill"):
+        wrong.setup()
+
+
+def test_statistics_are_those_of_the_training_transitions(trajectories, skill, tmp_path):
+    data = module(trajectories, skill, tmp_path)
+    data.prepare_data()
+    data.setup()
+    statistics = data.statistics()
+    rows = data.transitions.observations[data.train_index]
+    torch.testing.assert_close(statistics["observation_mean"], rows.mean(dim=0))
+    assert statistics["code_share"].sum().item() == pytest.approx(1.0)
+    rewards = data.transitions.rewards[data.train_index]
+    assert statistics["reward_range"] == pytest.approx((rewards.min().item(), rewards.max().item()))
+    assert statistics["max_discount"] == pytest.approx(0.99)
