@@ -13,7 +13,6 @@ skill was not carried through, and nothing ended.
 
 import hashlib
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -28,10 +27,21 @@ from torch import Tensor
 
 from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError
+from dds_lightning.files import written_whole
 from dds_lightning.skill import SkillModule
 
 Discount = Literal["per_skill", "per_step"]
 FORMAT = 1
+_STORED = (
+    "observations",
+    "codes",
+    "rewards",
+    "next_observations",
+    "discounts",
+    "dones",
+    "starts",
+    "episodes",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,18 +111,15 @@ class Relabelled:
 
     def save(self, path: str | Path, key: dict[str, str | int | float]) -> None:
         """Write the transitions and what they were made from, atomically, as one safetensors file."""
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-        metadata = {"format": str(FORMAT), "num_skills": str(self.num_skills), "key": json.dumps(key, sort_keys=True)}
-        names = ("observations", "codes", "rewards", "next_observations", "discounts", "dones", "starts", "episodes")
-        try:
-            save_file({name: getattr(self, name).contiguous().cpu() for name in names}, temporary, metadata=metadata)
-            with temporary.open("rb") as file:
-                os.fsync(file.fileno())
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        metadata = {
+            "format": str(FORMAT),
+            "num_skills": str(self.num_skills),
+            "key": json.dumps(key, sort_keys=True),
+        }
+        with written_whole(Path(path)) as part:
+            save_file(
+                {name: getattr(self, name).contiguous().cpu() for name in _STORED}, part, metadata=metadata
+            )
 
     @classmethod
     def load(cls, path: str | Path, key: dict[str, str | int | float] | None = None) -> "Relabelled":
@@ -132,14 +139,19 @@ class Relabelled:
         except FileNotFoundError:
             raise UserError(f"there is no relabelled file {path}: make it with `dds relabel`") from None
         except Exception as error:
-            raise UserError(f"{path} is no readable relabelled file ({error}): delete it and relabel") from error
+            raise UserError(
+                f"{path} is no readable relabelled file ({error}): delete it and relabel"
+            ) from error
         if metadata.get("format") != str(FORMAT):
             raise UserError(
                 f"{path} has relabelling format {metadata.get('format')!r}, this version reads {FORMAT}: relabel"
             )
         found = json.loads(metadata["key"])
         if key is not None and found != json.loads(json.dumps(key)):
-            wrong = [f"{name} {found.get(name)!r} instead of {value!r}" for name, value in key.items() if found.get(name) != value]
+            pairs = {
+                name: (found.get(name), value) for name, value in key.items() if found.get(name) != value
+            }
+            wrong = [f"{name} {there!r} instead of {wanted!r}" for name, (there, wanted) in pairs.items()]
             raise UserError(
                 f"{path} was relabelled with other inputs ({'; '.join(wrong)}): choose another file or relabel"
             )
@@ -208,7 +220,9 @@ def relabel(
     horizon = skill.horizon
     windows = trajectories.windows(horizon, stride, tail="terminated")
     starts, observation_starts, lengths = windows.starts, windows.observation_starts, windows.lengths
-    steps = np.minimum(np.arange(horizon), lengths[:, None] - 1)  # (M, H): a short segment repeats its last step
+    steps = np.minimum(
+        np.arange(horizon), lengths[:, None] - 1
+    )  # (M, H): a short segment repeats its last step
     device = skill.device
 
     codes = []

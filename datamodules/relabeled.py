@@ -64,7 +64,9 @@ class RelabeledDataModule(pl.LightningDataModule):
         self.save_hyperparameters()
         self.task: Task | None = get_task(task) if task else None
         if skill is None:
-            raise UserError("data.skill is missing: give the skill checkpoint (.ckpt or directory) to relabel with")
+            raise UserError(
+                "data.skill is missing: give the skill checkpoint (.ckpt or directory) to relabel with"
+            )
         if not 0.0 <= validation_fraction < 1.0:
             raise UserError(f"data.validation_fraction is {validation_fraction}, expected a share in [0, 1)")
         self.skill = SkillModule.load(skill)
@@ -74,7 +76,9 @@ class RelabeledDataModule(pl.LightningDataModule):
         self._given: Trajectories | None = None
 
     @classmethod
-    def from_trajectories(cls, trajectories: Trajectories, skill: str, **settings: Any) -> "RelabeledDataModule":
+    def from_trajectories(
+        cls, trajectories: Trajectories, skill: str, **settings: Any
+    ) -> "RelabeledDataModule":
         """Build the module over trajectories already in memory."""
         module = cls(skill=skill, **settings)
         module._given = trajectories
@@ -113,7 +117,9 @@ class RelabeledDataModule(pl.LightningDataModule):
         key = relabel_key(self.trajectories, self.skill, **self.settings)
         name = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:16]
         skill = Path(self.hparams.skill)
-        folder = Path(self.hparams.cache) if self.hparams.cache else (skill if skill.is_dir() else skill.parent)
+        folder = (
+            Path(self.hparams.cache) if self.hparams.cache else (skill if skill.is_dir() else skill.parent)
+        )
         return folder / f"relabelled-{name}.safetensors"
 
     def prepare_data(self) -> None:
@@ -133,7 +139,10 @@ class RelabeledDataModule(pl.LightningDataModule):
         h = self.hparams
         _, held_out = self.trajectories.split(h.validation_fraction, h.seed, self.skill.horizon)
         kept = torch.isin(self.transitions.episodes, torch.as_tensor(held_out))
-        self.train_index, self.validation_index = torch.nonzero(~kept).flatten(), torch.nonzero(kept).flatten()
+        self.train_index, self.validation_index = (
+            torch.nonzero(~kept).flatten(),
+            torch.nonzero(kept).flatten(),
+        )
 
     def statistics(self) -> dict[str, Any]:
         """What the policy keeps of the data: normalisation, code shares, range of rewards, greatest discount."""

@@ -61,9 +61,7 @@ class TensorLoader:
             device: Where the indices go.
         """
         if size < world_size:
-            raise UserError(
-                f"data: found {size} items for {world_size} processes, expected at least one each"
-            )
+            raise UserError(f"data: found {size} items for {world_size} processes, expected at least one each")
         if batch_size < 1:
             raise UserError(f"batch_size: found {batch_size}, expected at least 1")
         self.gather, self.size, self.shuffle, self.seed = gather, size, shuffle, seed
@@ -87,8 +85,7 @@ class TensorLoader:
         return torch.randperm(self.size, generator=generator)
 
     def __iter__(self) -> Iterator[Batch]:
-        """The next `len(self)` batches of the stream, or, without shuffling, those of an epoch from its "
-        "start."""
+        """The next `len(self)` batches of the stream; without shuffling, those of one epoch."""
         # All of this runs at the first `next`: Lightning makes iterators that it never starts. Nothing after
         # the last `yield` matters: it does not exhaust those that it does start.
         if not self.shuffle and not self._resuming:
@@ -241,9 +238,7 @@ class SegmentDataModule(pl.LightningDataModule):
             return
         data = self._loaded()
         self._windows = data.windows(self.horizon, self.stride)
-        self.training_episodes, self.validation_episodes = data.split(
-            self.validation_fraction, self.seed, self.horizon
-        )
+        self.training_episodes, self.validation_episodes = data.split(self.validation_fraction, self.seed, self.horizon)
         held_out = np.isin(self._windows.episodes, self.validation_episodes)
         self.training_segments = np.flatnonzero(~held_out)
         kept = np.flatnonzero(held_out)

@@ -70,36 +70,26 @@ def read_trajectories(directory: str | Path, *, mmap: bool = False, verify: bool
         try:
             arrays[key] = np.load(path, mmap_mode="r" if mmap else None, allow_pickle=False)
         except (OSError, ValueError, EOFError) as error:
-            raise DataError(
-                f"data set '{name}': {path} is missing, truncated or damaged ({error})"
-            ) from error
+            raise DataError(f"data set '{name}': {path} is missing, truncated or damaged ({error})") from error
         if arrays[key].dtype != dtype:
-            raise DataError(
-                f"data set '{name}', {key}: found type {arrays[key].dtype}, expected {np.dtype(dtype)}"
-            )
+            raise DataError(f"data set '{name}', {key}: found type {arrays[key].dtype}, expected {np.dtype(dtype)}")
     steps, episodes = len(arrays["rewards"]), len(arrays["lengths"])
     rows = {"actions": steps, "terminations": steps, "truncations": steps, "observations": steps + episodes}
     for key, expected in rows.items():
         if len(arrays[key]) != expected:
             raise DataError(f"data set '{name}', {key}: found {len(arrays[key])} rows, expected {expected}")
     if arrays["lengths"].sum() != steps:
-        raise DataError(
-            f"data set '{name}', lengths: they add up to {arrays['lengths'].sum()}, expected {steps}"
-        )
+        raise DataError(f"data set '{name}', lengths: they add up to {arrays['lengths'].sum()}, expected {steps}")
     trajectories = Trajectories(name=name, **arrays)
     if verify and trajectories.fingerprint() != fingerprint:
-        raise DataError(
-            f"data set '{name}': the arrays in {folder} do not match their fingerprint; they were changed"
-        )
+        raise DataError(f"data set '{name}': the arrays in {folder} do not match their fingerprint; they were changed")
     return trajectories
 
 
 def refuse_existing(folder: Path, overwrite: bool) -> None:
     """Raise UserError when `folder` exists and may not be replaced."""
     if folder.exists() and not overwrite:
-        raise UserError(
-            f"out: {folder} exists already; choose another place, or ask for it to be overwritten"
-        )
+        raise UserError(f"out: {folder} exists already; choose another place, or ask for it to be overwritten")
 
 
 def write_durably(path: Path, text: str) -> None:

@@ -118,9 +118,7 @@ class Trajectories:
         high = np.broadcast_to(np.asarray(action_high, np.float32), (action_dim,)).copy()
         names = episode_names or [f"episode {e}" for e in range(len(episodes))]
         checked = [
-            validate_episode(
-                name, label, fields, observation_dim=observation_dim, action_low=low, action_high=high
-            )
+            validate_episode(name, label, fields, observation_dim=observation_dim, action_low=low, action_high=high)
             for label, fields in zip(names, episodes, strict=True)
         ]
         joined = {key: np.concatenate([fields[key] for fields in checked]) for key in checked[0]}
@@ -222,9 +220,7 @@ class Trajectories:
         """The episode of each step, same shape as `steps`."""
         return np.searchsorted(self.step_offsets, np.asarray(steps), side="right") - 1
 
-    def split(
-        self, fraction: float, seed: int, horizon: int = 1
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def split(self, fraction: float, seed: int, horizon: int = 1) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Episodes for training and for validation, none in both.
 
         Episodes are drawn at random until they hold `fraction` of all steps. Those shorter than `horizon`

@@ -80,9 +80,7 @@ def _array(where: str, name: str, value: Any) -> NDArray[Any]:
     return array
 
 
-def _check_shapes(
-    where: str, arrays: dict[str, NDArray[Any]], observations: int | None, actions: int
-) -> None:
+def _check_shapes(where: str, arrays: dict[str, NDArray[Any]], observations: int | None, actions: int) -> None:
     steps = len(arrays["rewards"]) if arrays["rewards"].ndim else 0
     for name, width in (("observations", observations), ("actions", actions)):
         shape = arrays[name].shape
@@ -122,8 +120,7 @@ def _in_box(
     if len(outside):
         t, j = (int(i) for i in outside[0])
         raise DataError(
-            f"{where}, actions: found {actions[t, j]:g} at step {t}, column {j}, expected {low[j]:g} to "
-            f"{high[j]:g}"
+            f"{where}, actions: found {actions[t, j]:g} at step {t}, column {j}, expected {low[j]:g} to {high[j]:g}"
         )
     return np.clip(actions, low, high)
 

@@ -1,9 +1,10 @@
-"""Whoever acts in environments, and how several agents share one decoder batch."""
+"""Whoever acts in environments: what an actor is, and how several agents share one decoder batch."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Protocol
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
@@ -110,3 +111,28 @@ class AgentGroup:
             for agent, part, start in zip(self.agents, parts, self._starts, strict=False)
         ]
         return lead.decode(x, np.concatenate(codes))
+
+
+@dataclass(frozen=True)
+class Contestant:
+    """Who plays, and how often.
+
+    Attributes:
+        name: shown in the table; unique within a rollout.
+        actor: acts; see `Actor`.
+        episodes: how many.
+        labels: one an episode, for a contestant of several parts (each single skill). With L different
+            labels, row r of the actor plays only episodes of label r modulo L, in order of first appearance.
+    """
+
+    name: str
+    actor: Any
+    episodes: int
+    labels: Sequence[str] | None = None
+
+
+def single_skills(agent: Any, episodes_each: int = 20, name: str = "single skill") -> Contestant:
+    """Every skill replayed alone, `episodes_each` times, labelled "skill 0", "skill 1" and so on."""
+    count = agent.num_skills
+    labels = [f"skill {k}" for k in range(count)] * episodes_each
+    return Contestant(name, agent.variant("fixed", fixed_codes=np.arange(count)), len(labels), labels)

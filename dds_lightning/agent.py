@@ -82,6 +82,8 @@ class DDSAgent(nn.Module):
 
     def _check(self) -> None:
         choices, codes, last = get_args(AgentSelection), self.fixed_codes, self.num_skills - 1
+        if not getattr(self.skill, "discrete", True):
+            raise UserError("the skill model's bottleneck is gaussian: an agent needs discrete skills (vq)")
         if self.selection not in choices:
             raise UserError(f"selection is '{self.selection}', expected one of {', '.join(choices)}")
         if self.temperature <= 0:
@@ -111,7 +113,7 @@ class DDSAgent(nn.Module):
             selection: as in the constructor; this agent's without it.
             **settings: `temperature`, `noise_scale`, `fixed_codes`, `seed`, as in the constructor.
         """
-        own = {"selection": selection or self.selection, "temperature": self.temperature}
+        own: dict[str, Any] = {"selection": selection or self.selection, "temperature": self.temperature}
         own |= {"noise_scale": self.noise_scale, "seed": self._seed}
         if own["selection"] == "fixed":
             own["fixed_codes"] = self.fixed_codes

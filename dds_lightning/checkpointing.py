@@ -27,8 +27,8 @@ M = TypeVar("M", bound=nn.Module)
 class AtomicCheckpointIO(TorchCheckpointIO):
     """Lightning's checkpoint files, written beside their place, synced, checked and only then renamed.
 
-    A full disk, a kill or a read-only folder leaves the previous file as it was, and the error is raised. Local
-    paths only.
+    A full disk, a kill or a read-only folder leaves the previous file as it was, and the error is raised.
+    Local paths only.
     """
 
     def save_checkpoint(

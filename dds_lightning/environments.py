@@ -45,9 +45,7 @@ class TaskEnv(gym.Wrapper[NDArray[np.float32], NDArray[np.float32], Any, Any]):
         info["success"] = bool(np.linalg.norm(info["position"] - maze.goal) <= self.task.goal_radius)
         return flat, info
 
-    def step(
-        self, action: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """One step of the environment."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         flat, info = self._outside(observation, info)

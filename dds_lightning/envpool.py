@@ -146,8 +146,8 @@ class EnvPool:
         self._alive = np.zeros(num_envs, dtype=bool)
         self._broken = True
         try:
-            for part, slots in enumerate(self._slots):
-                name = f"environment worker {part} of {workers} ({task.name})"
+            for number, slots in enumerate(self._slots):
+                name = f"environment worker {number} of {workers} ({task.name})"
                 self._parts.append(_Remote(task, len(slots), name) if workers else _Local(task, len(slots)))
             for part in self._parts:
                 if isinstance(part, _Remote):

@@ -24,6 +24,10 @@ from dds_lightning.errors import UserError
 from dds_lightning.reports import Report, table
 from dds_lightning.training import BestCheckpoint, RollingCheckpoint, trainer_settings
 
+DESCRIPTION = {
+    "skill": "Stage one: learn discrete skills from segments of trajectories.",
+    "policy": "Stage two: learn from relabelled data when to use which skill.",
+}
 STEPS = {"skill": 500_000, "policy": 1_500_000}  # the paper's, as are the defaults of the modules
 LINKS = {"skill": ("observation_dim", "action_dim", "horizon"), "policy": ("observation_dim", "num_skills")}
 
@@ -69,7 +73,12 @@ class StageCLI(LightningCLI):
                 "max_epochs": -1,
                 "max_steps": STEPS[stage],
             },
-            parser_kwargs={"prog": f"dds {stage}", **parser, **dict.fromkeys(self.subcommands(), parser)},
+            parser_kwargs={
+                "prog": f"dds {stage}",
+                "description": DESCRIPTION[stage],
+                **parser,
+                **dict.fromkeys(self.subcommands(), parser),
+            },
             auto_configure_optimizers=False,
             load_from_checkpoint_support=False,  # our checkpoints name no class to import
         )
@@ -80,7 +89,6 @@ class StageCLI(LightningCLI):
         """Add the checkpoints' settings, `--json`, and the links from data to model."""
         parser.add_lightning_class_args(RollingCheckpoint, "checkpoint")
         parser.add_lightning_class_args(BestCheckpoint, "best")
-        parser.link_arguments("checkpoint.dirpath", "best.dirpath", apply_on="parse")
         parser.add_argument("--json", action="store_true", help="print one JSON document and nothing else")
         for name in LINKS[self.stage]:
             parser.link_arguments(f"data.{name}", f"model.{name}", apply_on="instantiate")
@@ -115,7 +123,8 @@ class StageCLI(LightningCLI):
             if name in chosen and chosen[name] != value:
                 raise UserError(
                     f"--model.{name} is {chosen[name]!r}, but checkpoint {path} was trained with {value!r}, "
-                    "and --ckpt_path continues exactly that training: leave the setting out, or train anew"
+                    f"and --ckpt_path continues exactly that training: give --model.{name}={value}, or train "
+                    "anew without --ckpt_path"
                 )
             if name not in LINKS[self.stage] and name in settings.model:
                 settings.model[name] = value
@@ -172,11 +181,7 @@ class StageCLI(LightningCLI):
                 (c.path for c in self.trainer.checkpoint_callbacks if isinstance(c, RollingCheckpoint)), None
             ),
             "best": next(
-                (
-                    c.best_model_path
-                    for c in self.trainer.checkpoint_callbacks
-                    if isinstance(c, BestCheckpoint)
-                ),
+                (c.best_model_path for c in self.trainer.checkpoint_callbacks if isinstance(c, BestCheckpoint)),
                 None,
             )
             or None,
@@ -254,6 +259,8 @@ def quieten() -> None:
         ".*Checkpoint directory .* exists and is not empty.*",
         ".*You're resuming from a checkpoint that ended before the epoch ended.*",
         ".*`IterableDataset` has `__len__` defined.*",
+        ".*The number of training batches .* is smaller than the logging interval.*",
+        ".*isinstance.treespec, LeafSpec.*",
     ):
         warnings.filterwarnings("ignore", message=text)
 

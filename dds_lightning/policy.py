@@ -302,7 +302,7 @@ class PolicyModule(pl.LightningModule):
         if "clipped_share" in info and info["clipped_share"].item() > 0.5:
             warnings.warn(
                 f"step {self.global_step}: {100 * info['clipped_share'].item():.0f} % of the AWR weights are clipped "
-                f"at {self.hparams.weight_clip:g}: the policy clones them all alike. Lower alpha or the rewards' scale.",
+                f"at {self.hparams.weight_clip:g}: the policy clones them all alike. Lower alpha or the reward scale.",
                 stacklevel=2,
             )
 

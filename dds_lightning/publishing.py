@@ -183,8 +183,8 @@ def _verify_sums(directory: Path) -> None:
     for name in CONTENTS:
         if sums.get(name) != sha256(directory / name):
             raise UserError(
-                f"{directory / name} is not the file that was published (its hash differs from {SUMS}): fetch the "
-                "directory again, or, after a change of your own, run `sha256sum` on the files anew"
+                f"{directory / name} is not the file that was published (its hash differs from {SUMS}): "
+                "fetch the directory again; after a change of your own, write the sums anew with `sha256sum`"
             )
 
 

@@ -21,7 +21,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from dds_lightning.actors import Actor
+from dds_lightning.actors import Actor, Contestant
+from dds_lightning.actors import single_skills as single_skills
 from dds_lightning.envpool import EnvPool
 from dds_lightning.errors import UserError
 from dds_lightning.results import RolloutPath as RolloutPath
@@ -29,31 +30,6 @@ from dds_lightning.results import RolloutResult as RolloutResult
 from dds_lightning.tasks import Task, get_task
 
 DEFAULT_SLOTS = 128
-
-
-@dataclass(frozen=True)
-class Contestant:
-    """Who plays, and how often.
-
-    Attributes:
-        name: shown in the table; unique within a rollout.
-        actor: acts; see `dds_lightning.actors.Actor`.
-        episodes: how many.
-        labels: one an episode, for a contestant of several parts (each single skill). With L different labels,
-            row r of the actor plays only episodes of label number r modulo L, in order of first appearance.
-    """
-
-    name: str
-    actor: Any
-    episodes: int
-    labels: Sequence[str] | None = None
-
-
-def single_skills(agent: Any, episodes_each: int = 20, name: str = "single skill") -> Contestant:
-    """Every skill replayed alone, `episodes_each` times, labelled "skill 0", "skill 1" and so on."""
-    count = agent.num_skills
-    labels = [f"skill {k}" for k in range(count)] * episodes_each
-    return Contestant(name, agent.variant("fixed", fixed_codes=np.arange(count)), len(labels), labels)
 
 
 @dataclass(frozen=True)

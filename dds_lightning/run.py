@@ -79,8 +79,7 @@ class Run:
         self.data_signature = _signature(settings.data)
         # Parsing both commands now finds a wrong setting before the data are collected.
         self.settings = {
-            stage: settings_of(stage, self._words(stage, settings.data or "local:."))
-            for stage in ("skill", "policy")
+            stage: settings_of(stage, self._words(stage, settings.data or "local:.")) for stage in ("skill", "policy")
         }
         self.console = Console(stderr=True)
 
@@ -115,9 +114,7 @@ class Run:
         if last < 2:
             return
         settings = {"task": self.task.name, **self._relabelling()}
-        relabelled = stages.do(
-            "relabel", "relabel: segments to skills", settings, [data, self.skill], self._relabel
-        )
+        relabelled = stages.do("relabel", "relabel: segments to skills", settings, [data, self.skill], self._relabel)
         if last < 3:
             return
         self.relabelled = relabelled
@@ -145,9 +142,7 @@ class Run:
         if last < 6:
             return
         everything = [relabelled, self.skill, self.policy, self.evaluated]
-        stages.do(
-            "report", "report: table, figures, clip", {"task": self.task.name}, everything, self._write_report
-        )
+        stages.do("report", "report: table, figures, clip", {"task": self.task.name}, everything, self._write_report)
 
     # ---------------------------------------------------------------- the stages
 
@@ -186,7 +181,6 @@ class Run:
         config = self.settings[stage]
         trainer = {key: value for key, value in config["trainer"].items() if key not in _PLACES}
         data = {key: value for key, value in config["data"].items() if key not in ("data", "skill", "cache")}
-        best = {key: value for key, value in config["best"].items() if key != "dirpath"}
         return {
             "seed": config["seed_everything"],
             "trainer": trainer,
@@ -330,9 +324,7 @@ def _signature(spec: str | None) -> str | None:
 
         folder = minari_root() / rest
     if not rest or not folder.exists():
-        raise UserError(
-            f"data: there is nothing at {folder} (from {spec!r}); expected local:DIR or minari:ID"
-        )
+        raise UserError(f"data: there is nothing at {folder} (from {spec!r}); expected local:DIR or minari:ID")
     files = sorted(entry for entry in folder.rglob("*") if entry.is_file())
     facts = [(str(f.relative_to(folder)), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
     return hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:16]

@@ -270,7 +270,7 @@ class SkillModule(pl.LightningModule):
 
     def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """One optimiser step's loss."""
-        total, terms, skill = self.loss(batch)
+        total, terms, _ = self.loss(batch)
         if self.global_step % self.trainer.log_every_n_steps == 0:
             log = {"loss": total.detach(), **terms}
             if isinstance(self.bottleneck, Codebook):

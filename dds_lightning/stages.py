@@ -86,12 +86,7 @@ class Stages:
         expected = {"settings": _json(settings), "inputs": {stage.name: stage.digest for stage in reads}}
         marker = _read(folder / MARKER)
         same = {key: marker.get(key) for key in expected} == expected and marker.get("format") == FORMAT
-        if (
-            same
-            and marker.get("state") == "finished"
-            and not self.fresh
-            and (found := _found(folder, marker))
-        ):
+        if same and marker.get("state") == "finished" and not self.fresh and (found := _found(folder, marker)):
             self._say(f"{title}: done before, in {duration(found.seconds)}", "dim")
             self.done.append(found)
             return found

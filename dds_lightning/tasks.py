@@ -211,9 +211,7 @@ def _pointmaze(
 
 
 _ROWS: tuple[Task, ...] = (
-    *_pointmaze(
-        "umaze", maze_map=_UMAZE, cap=300, start=(1, 1), goal=(3, 1), play=((1, 1), (1, 3), (3, 3), (3, 1))
-    ),
+    *_pointmaze("umaze", maze_map=_UMAZE, cap=300, start=(1, 1), goal=(3, 1), play=((1, 1), (1, 3), (3, 3), (3, 1))),
     *_pointmaze(
         "medium",
         maze_map=_MEDIUM,

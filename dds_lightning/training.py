@@ -7,16 +7,17 @@ differ.
 import time
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import lightning.pytorch as pl
-from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, ProgressBar, RichProgressBar
+from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, ProgressBar
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
 from dds_lightning import interrupts
 from dds_lightning.callbacks import ExactResume, FiniteGuard
 from dds_lightning.checkpointing import AtomicCheckpointIO
 from dds_lightning.errors import UserError
+from dds_lightning.progress import StepProgress
 
 
 class RollingCheckpoint(Checkpoint):
@@ -32,14 +33,10 @@ class RollingCheckpoint(Checkpoint):
         every_n_steps: steps between two writes; 0 for none by steps.
     """
 
-    def __init__(
-        self, dirpath: str | None = None, every_n_seconds: float = 60.0, every_n_steps: int = 0
-    ) -> None:
+    def __init__(self, dirpath: str | None = None, every_n_seconds: float = 60.0, every_n_steps: int = 0) -> None:
         if every_n_seconds < 0 or every_n_steps < 0:
             found = f"{every_n_seconds} and {every_n_steps}"
-            raise UserError(
-                f"checkpoint.every_n_seconds and checkpoint.every_n_steps are {found}, expected 0 or more"
-            )
+            raise UserError(f"checkpoint.every_n_seconds and checkpoint.every_n_steps are {found}, expected 0 or more")
         self.dirpath = dirpath
         self.every_n_seconds = every_n_seconds
         self.every_n_steps = every_n_steps
@@ -88,18 +85,15 @@ class RollingCheckpoint(Checkpoint):
 
 
 class BestCheckpoint(ModelCheckpoint):
-    """Also keep the checkpoint with the best value of a logged metric, as `best.ckpt`.
+    """Also keep the checkpoint with the best value of a logged metric, as `best.ckpt` beside `last.ckpt`.
 
     Args:
-        dirpath: folder of the file; null puts it beside the logs of this launch.
         monitor: name of the metric, e.g. `rollout/success`; null keeps none.
         mode: `max` or `min`.
     """
 
-    def __init__(self, dirpath: str | None = None, monitor: str | None = None, mode: str = "max") -> None:
-        super().__init__(
-            dirpath, filename="best", monitor=monitor, mode=mode, save_top_k=1, enable_version_counter=False
-        )
+    def __init__(self, monitor: str | None = None, mode: Literal["max", "min"] = "max") -> None:
+        super().__init__(filename="best", monitor=monitor, mode=mode, save_top_k=1, enable_version_counter=False)
 
 
 def loggers(root: str | Path) -> list[Logger]:
@@ -137,13 +131,17 @@ def trainer_settings(config: dict[str, Any], extra: list[Callback]) -> dict[str,
         *(callback for callback in extra if saves or not isinstance(callback, Checkpoint)),
     ]
     callbacks = [c for c in callbacks if not (isinstance(c, BestCheckpoint) and c.monitor is None)]
+    rolling = next((c for c in callbacks if isinstance(c, RollingCheckpoint)), None)
+    for callback in callbacks:
+        if isinstance(callback, BestCheckpoint) and rolling is not None:
+            callback.dirpath = rolling.dirpath
     for default in (ExactResume, FiniteGuard):
         if not any(isinstance(callback, default) for callback in callbacks):
             callbacks.append(default())
     if config.get("enable_progress_bar") is not False and not any(
         isinstance(callback, ProgressBar) for callback in callbacks
     ):
-        callbacks.append(RichProgressBar(refresh_rate=20))
+        callbacks.append(StepProgress())
     config["callbacks"] = callbacks
 
     plugins = config.get("plugins") or []

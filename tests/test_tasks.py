@@ -14,9 +14,7 @@ from dds_lightning.environments import build_env
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import get_task, known_env_ids, task_names, task_table
 
-POINTMAZES = [
-    f"pointmaze-{size}-{recipe}" for size in ("umaze", "medium", "large") for recipe in ("play", "diverse")
-]
+POINTMAZES = [f"pointmaze-{size}-{recipe}" for size in ("umaze", "medium", "large") for recipe in ("play", "diverse")]
 
 
 def test_the_table_has_the_six_pointmazes() -> None:
@@ -103,7 +101,7 @@ def test_episodes_end_at_the_goal_or_at_the_cap() -> None:
         assert (reward, terminated, info["success"]) == (0.0, False, False)
         assert truncated == (step == task.max_episode_steps - 1)
     env.reset(seed=0)
-    inside = task.goal_xy() + [task.goal_radius - 0.05, 0.0]
+    inside = task.goal_xy() + np.array([task.goal_radius - 0.05, 0.0])
     env.unwrapped.point_env.set_state(inside, np.zeros(2))  # type: ignore[attr-defined]
     _, reward, terminated, truncated, info = env.step(still)
     assert (reward, terminated, truncated, info["success"]) == (1.0, True, False, True)

@@ -82,9 +82,7 @@ class Driver:
         """Draw an episode's noise: action noise, bursts, waypoint offsets; after `steps` it repeats."""
         self._noise = (noise.action_noise * rng.standard_normal((steps, 2))).tolist()
         self._burst = _bursts(rng, steps, noise)
-        self._offsets = (
-            rng.uniform(-noise.waypoint_offset, noise.waypoint_offset, (steps, 2)) * self.size
-        ).tolist()
+        self._offsets = (rng.uniform(-noise.waypoint_offset, noise.waypoint_offset, (steps, 2)) * self.size).tolist()
         self._step, self._cell, self._goal = 0, -1, -1
         self._target = [0.0, 0.0]
 

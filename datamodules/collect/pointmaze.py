@@ -299,9 +299,7 @@ class WaypointController:
     def _restart(self, driver: Driver) -> None:
         driver.start_episode(self._rng, self.task.max_episode_steps, self.noise)
 
-    def act(
-        self, observations: NDArray[np.float32], restarted: NDArray[np.bool_] | None = None
-    ) -> NDArray[np.float32]:
+    def act(self, observations: NDArray[np.float32], restarted: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
         """Actions for a batch.
 
         Args:

@@ -82,9 +82,7 @@ def read_metadata(data: Path) -> dict[str, Any]:
     """
     path = data / "metadata.json"
     if not path.is_file():
-        raise DataError(
-            f"data: {path} is missing, so {data} holds no Minari data set; found {_listing(data)}"
-        )
+        raise DataError(f"data: {path} is missing, so {data} holds no Minari data set; found {_listing(data)}")
     try:
         metadata = dict(json.loads(path.read_text(encoding="utf-8")))
     except (ValueError, TypeError, RecursionError) as error:
@@ -123,9 +121,7 @@ def _env_spec(name: str, text: Any) -> dict[str, Any] | None:
                 f"{' and '.join(_TRUSTED_PACKAGES)}; do not open this data set with other tools"
             )
     if env_id not in known_env_ids():
-        raise DataError(
-            f"data set '{name}': it was recorded in '{env_id}', which no task uses; see `dds tasks`"
-        )
+        raise DataError(f"data set '{name}': it was recorded in '{env_id}', which no task uses; see `dds tasks`")
     return dict(spec)
 
 
@@ -189,9 +185,7 @@ def _read_hdf5(
     steps = sum(len(fields["rewards"]) for fields in episodes)
     promised = metadata.get("total_steps")
     if promised is not None and steps != promised:
-        raise DataError(
-            f"data set '{name}': metadata.json promises {promised} steps, but {path} holds {steps}"
-        )
+        raise DataError(f"data set '{name}': metadata.json promises {promised} steps, but {path} holds {steps}")
     return labels, episodes
 
 
@@ -217,9 +211,7 @@ def _read_episode(file: h5py.File, name: str, label: str, task: Task | None) -> 
 def _observation(group: h5py.Group, key: str, where: str, task: Task | None) -> h5py.Dataset:
     """The flat part of a dictionary observation; goals are left out, because a task has one."""
     if key != "observations" or "observation" not in group:
-        raise DataError(
-            f"{where}, {key}: found the entries {', '.join(group) or 'none'}, expected 'observation'"
-        )
+        raise DataError(f"{where}, {key}: found the entries {', '.join(group) or 'none'}, expected 'observation'")
     node = _member(group, "observation", f"{where}, {key}")
     if not isinstance(node, h5py.Dataset):
         raise DataError(f"{where}, {key}: 'observation' is no array")

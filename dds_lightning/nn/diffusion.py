@@ -35,7 +35,11 @@ class ResidualBlock(nn.Module):
     def __init__(self, dim: int, dropout: float) -> None:
         super().__init__()
         self.net = nn.Sequential(
-            nn.LayerNorm(dim), nn.Dropout(dropout), nn.Linear(dim, 4 * dim), nn.ReLU(), nn.Linear(4 * dim, dim)
+            nn.LayerNorm(dim),
+            nn.Dropout(dropout),
+            nn.Linear(dim, 4 * dim),
+            nn.ReLU(),
+            nn.Linear(4 * dim, dim),
         )
 
     def forward(self, x: Tensor) -> Tensor:
@@ -179,7 +183,9 @@ class DiffusionDecoder(nn.Module):
                 x = previous.sqrt() * x0 + (1.0 - previous).sqrt() * noise
                 continue
             beta = self.betas[i]
-            mean = (previous.sqrt() * beta * x0 + (1.0 - beta).sqrt() * (1.0 - previous) * x) / (1.0 - alpha_bar)
+            mean = (previous.sqrt() * beta * x0 + (1.0 - beta).sqrt() * (1.0 - previous) * x) / (
+                1.0 - alpha_bar
+            )
             variance = beta * (1.0 - previous) / (1.0 - alpha_bar)
             x = mean + variance.sqrt() * draw()
         raise AssertionError("unreachable: the loop returns at i = 0")

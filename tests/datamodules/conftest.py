@@ -20,9 +20,7 @@ def make_episode() -> Callable[..., dict[str, Any]]:
     def make(steps: int, number: int = 0, *, terminated: bool = False) -> dict[str, Any]:
         end = np.arange(steps) == steps - 1
         return {
-            "observations": np.stack([np.full(steps + 1, number), np.arange(steps + 1)], axis=1).astype(
-                float
-            ),
+            "observations": np.stack([np.full(steps + 1, number), np.arange(steps + 1)], axis=1).astype(float),
             "actions": (np.arange(steps, dtype=np.float32) / 100)[:, None],
             "rewards": np.arange(steps, dtype=np.float64),
             "terminations": end & terminated,
@@ -55,9 +53,7 @@ def minari_set(tmp_path: Path) -> Callable[..., Path]:
             "data_format": "hdf5",
             "observation_space": json.dumps({"type": "Dict", "subspaces": {}}),
             "action_space": json.dumps(box),
-            "env_spec": json.dumps(
-                {"id": get_task(task).env_id, "entry_point": "gymnasium_robotics:PointMazeEnv"}
-            ),
+            "env_spec": json.dumps({"id": get_task(task).env_id, "entry_point": "gymnasium_robotics:PointMazeEnv"}),
         }
         facts.update(metadata or {})
         facts = {key: value for key, value in facts.items() if value is not None}

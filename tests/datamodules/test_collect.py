@@ -23,9 +23,7 @@ LARGE = "pointmaze-large-diverse"
 def _arrays(folder: Path) -> dict[str, np.ndarray]:
     found: dict[str, np.ndarray] = {}
     with h5py.File(folder / "data" / "main_data.hdf5") as file:
-        file.visititems(
-            lambda name, node: found.update({name: node[()]}) if isinstance(node, h5py.Dataset) else None
-        )
+        file.visititems(lambda name, node: found.update({name: node[()]}) if isinstance(node, h5py.Dataset) else None)
     return found
 
 
@@ -38,9 +36,7 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def large_play(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("play")
-    return collect_pointmaze(
-        "pointmaze-large-play", 3_000, 1, root, workers=1, progress=False, action_noise=0.0
-    )
+    return collect_pointmaze("pointmaze-large-play", 3_000, 1, root, workers=1, progress=False, action_noise=0.0)
 
 
 def test_the_same_seed_gives_the_same_bytes_whatever_the_workers(large: Path, tmp_path: Path) -> None:
@@ -59,9 +55,7 @@ def test_another_seed_gives_other_data(large: Path, tmp_path: Path) -> None:
     assert not np.array_equal(_arrays(other)["episode_0/actions"], _arrays(large)["episode_0/actions"])
 
 
-def test_minari_opens_it_and_makes_the_same_environments(
-    large: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_minari_opens_it_and_makes_the_same_environments(large: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(large.parent))
     data = minari.load_dataset("pointmaze-large-diverse-v0")
     assert (data.total_episodes, data.total_steps) == (5, 2_250)
@@ -101,11 +95,7 @@ def test_minari_opens_it_and_makes_the_same_environments(
 def test_rewards_success_and_goals_are_the_environments(large_play: Path) -> None:
     reached = 0
     for number in range(6):
-        episode = {
-            k.partition("/")[2]: v
-            for k, v in _arrays(large_play).items()
-            if k.startswith(f"episode_{number}/")
-        }
+        episode = {k.partition("/")[2]: v for k, v in _arrays(large_play).items() if k.startswith(f"episode_{number}/")}
         places, goals = episode["observations/achieved_goal"], episode["observations/desired_goal"]
         np.testing.assert_array_equal(places, episode["observations/observation"][:, :2])
         near = np.linalg.norm(places - goals, axis=1) <= 0.45
@@ -167,9 +157,7 @@ def test_what_was_collected_loads_for_its_task_only(large: Path) -> None:
     data = load_trajectories(f"local:{large}", LARGE)
     assert data.observation_dim == 4
     assert data.rewards.sum() == data.terminations.sum()
-    with pytest.raises(
-        DataError, match="recorded in PointMaze_Large-v3, but task 'pointmaze-umaze-play' needs"
-    ):
+    with pytest.raises(DataError, match="recorded in PointMaze_Large-v3, but task 'pointmaze-umaze-play' needs"):
         load_trajectories(f"local:{large}", "pointmaze-umaze-play")
     recorded = load_trajectories(f"local:{large}", LARGE, reward="recorded")
     assert (recorded.num_episodes, recorded.num_steps) == (5, 2_250)
@@ -185,7 +173,7 @@ def test_flipped_bytes_of_the_data_are_noticed(large: Path, tmp_path: Path) -> N
         broken = bytearray(whole)
         broken[place + offset] ^= 1
         (tmp_path / "data" / "main_data.hdf5").write_bytes(broken)
-        with pytest.raises(DataError, match="episode_1, observations: .* is damaged there"):
+        with pytest.raises(DataError, match=r"episode_1, observations: .* is damaged there"):
             load_trajectories(f"local:{tmp_path}", LARGE)
 
 

@@ -10,13 +10,13 @@ from datamodules.trajectories import DataError, Trajectories
 from dds_lightning.tasks import get_task
 
 TASK = get_task("pointmaze-large-diverse")
-O, I = "O", "I"  # outside and inside the goal region
 
 
 def _walk(places: str, *, terminated: bool = False) -> dict[str, Any]:
-    """An episode that is on the goal where `places` says I; column 2 counts the recorded states."""
+    """An episode that is on the goal where `places` says I and off it where it says O; column 2 counts the "
+    "recorded states."""
     states = np.zeros((len(places), 4))
-    states[:, 0] = [TASK.goal_xy()[0] - (0.44 if place == I else 0.46) for place in places]
+    states[:, 0] = [TASK.goal_xy()[0] - (0.44 if place == "I" else 0.46) for place in places]
     states[:, 1] = TASK.goal_xy()[1]
     states[:, 2] = np.arange(len(places))
     steps = len(places) - 1
@@ -43,9 +43,7 @@ def _walk(places: str, *, terminated: bool = False) -> dict[str, Any]:
         ("OIIOOIOO", [(0, 1, True), (3, 5, True), (6, 7, False)]),
     ],
 )
-def test_episodes_are_cut_where_the_goal_is_reached(
-    places: str, expected: list[tuple[int, int, bool]]
-) -> None:
+def test_episodes_are_cut_where_the_goal_is_reached(places: str, expected: list[tuple[int, int, bool]]) -> None:
     data = relabel_to_goal(Trajectories.from_episodes("walk", [_walk(places)]), TASK)
     found = []
     for e in range(data.num_episodes):
@@ -55,9 +53,7 @@ def test_episodes_are_cut_where_the_goal_is_reached(
         np.testing.assert_allclose(episode["actions"][:, 0], states[:-1] / 10, rtol=1e-6)
         reached = bool(episode["terminations"][-1])
         assert bool(episode["truncations"][-1]) is not reached
-        np.testing.assert_array_equal(
-            episode["rewards"], (np.arange(len(states) - 1) == len(states) - 2) & reached
-        )
+        np.testing.assert_array_equal(episode["rewards"], (np.arange(len(states) - 1) == len(states) - 2) & reached)
         found.append((states[0], states[-1], reached))
     assert found == expected
 

@@ -16,9 +16,7 @@ LARGE = "pointmaze-large-diverse"
 
 
 def test_facts_are_counted_by_hand(make_episode: Make) -> None:
-    data = Trajectories.from_episodes(
-        "made", [make_episode(n, e, terminated=e == 1) for e, n in enumerate((5, 3, 6))]
-    )
+    data = Trajectories.from_episodes("made", [make_episode(n, e, terminated=e == 1) for e, n in enumerate((5, 3, 6))])
     facts, dimensions = describe(data, horizon=3)
     expected = {
         "data set": "made",

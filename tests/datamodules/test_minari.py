@@ -19,9 +19,7 @@ LARGE = "pointmaze-large-diverse"
 
 
 def _spec(**entries: Any) -> str:
-    return json.dumps(
-        {"id": "PointMaze_Large-v3", "entry_point": "gymnasium_robotics:PointMazeEnv", **entries}
-    )
+    return json.dumps({"id": "PointMaze_Large-v3", "entry_point": "gymnasium_robotics:PointMazeEnv", **entries})
 
 
 def test_a_sound_set_is_read(minari_set: Write) -> None:
@@ -38,7 +36,7 @@ def test_by_id_from_minaris_folder(minari_set: Write, monkeypatch: pytest.Monkey
     folder = minari_set()
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder.parent))
     assert load_trajectories("minari:set-v0", LARGE).num_steps == 24
-    with pytest.raises(DataError, match="data set 'other-v0' is not in .*dds data collect"):
+    with pytest.raises(DataError, match=r"data set 'other-v0' is not in .*dds data collect"):
         load_trajectories("minari:other-v0", LARGE)
     with pytest.raises(UserError, match="is no Minari id"):
         load_trajectories("minari:../set-v0", LARGE)
@@ -46,9 +44,7 @@ def test_by_id_from_minaris_folder(minari_set: Write, monkeypatch: pytest.Monkey
 
 @pytest.mark.parametrize("spec", ["", "local", "local:", "http://somewhere", "nowhere:x"])
 def test_an_unknown_source_lists_those_there_are(spec: str) -> None:
-    with pytest.raises(
-        UserError, match=r"data: found '.*', expected one of local:..., minari:..., arrays:..."
-    ):
+    with pytest.raises(UserError, match=r"data: found '.*', expected one of local:..., minari:..., arrays:..."):
         load_trajectories(spec, LARGE)
 
 
@@ -80,11 +76,7 @@ HOSTILE = {
     "no action space": ({"action_space": None}, "has no action_space; Minari would run"),
     "damaged space": ({"action_space": "{"}, "action_space in metadata.json is damaged"),
     "unbounded actions": (
-        {
-            "action_space": json.dumps(
-                {"type": "Box", "shape": [2], "low": [-1, -1], "high": [1, float("inf")]}
-            )
-        },
+        {"action_space": json.dumps({"type": "Box", "shape": [2], "low": [-1, -1], "high": [1, float("inf")]})},
         "expected a bounded Box",
     ),
     "discrete actions": (
@@ -97,11 +89,7 @@ HOSTILE = {
         "names the code 'gymnasium_evil",
     ),
     "foreign wrapper": (
-        {
-            "env_spec": _spec(
-                additional_wrappers=[{"name": "w", "entry_point": "shutil:rmtree", "kwargs": {}}]
-            )
-        },
+        {"env_spec": _spec(additional_wrappers=[{"name": "w", "entry_point": "shutil:rmtree", "kwargs": {}}])},
         "names the code 'shutil:rmtree'",
     ),
     "unknown environment": ({"env_spec": _spec(id="Evil-v0")}, "recorded in 'Evil-v0', which no task uses"),
@@ -121,9 +109,7 @@ HOSTILE = {
 def test_metadata_are_not_trusted(case: str, minari_set: Write, monkeypatch: pytest.MonkeyPatch) -> None:
     import gymnasium
 
-    monkeypatch.setattr(
-        gymnasium, "make", lambda *a, **k: pytest.fail("an environment was built from a data set")
-    )
+    monkeypatch.setattr(gymnasium, "make", lambda *a, **k: pytest.fail("an environment was built from a data set"))
     metadata, message = HOSTILE[case]
     with pytest.raises(DataError, match=message):
         load_trajectories(f"local:{minari_set(metadata=metadata)}", LARGE)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 
 from datamodules.collect.planner import MazePlanner
@@ -32,7 +34,7 @@ def test_paths_are_shortest_and_stay_in_free_cells() -> None:
             assert path[0] == start
             assert path[-1] == goal
             assert set(path) <= free
-            assert all(abs(a[0] - b[0]) + abs(a[1] - b[1]) == 1 for a, b in zip(path, path[1:], strict=False))
+            assert all(abs(a[0] - b[0]) + abs(a[1] - b[1]) == 1 for a, b in pairwise(path))
             assert len(path) - 1 == planner.distances_to(goal)[start] == planner.distances_to(start)[goal]
 
 

@@ -56,7 +56,9 @@ def test_every_end_of_an_episode(trajectories, skill):
 
 def test_discount_per_step_counts_the_steps_really_taken(trajectories, skill):
     made = relabel(trajectories, skill, gamma=0.5, discount="per_step")
-    assert made.discounts.tolist() == pytest.approx([0.125, 0.125, 0.125, 0.25, 0.5, 0.125, 0.125, 0.125, 0.25, 0.5])
+    assert made.discounts.tolist() == pytest.approx(
+        [0.125, 0.125, 0.125, 0.25, 0.5, 0.125, 0.125, 0.125, 0.25, 0.5]
+    )
 
 
 def test_the_learning_reward_is_shifted_then_scaled(trajectories, skill):
@@ -103,7 +105,7 @@ def test_saved_and_read_back_is_the_same(trajectories, skill, tmp_path):
     back = Relabelled.load(path, key)
     for name in ("observations", "codes", "rewards", "next_observations", "discounts", "dones", "starts"):
         assert torch.equal(getattr(back, name), getattr(made, name))
-    with pytest.raises(UserError, match="other inputs .gamma 0.99 instead of 0.9"):
+    with pytest.raises(UserError, match=r"other inputs .gamma 0\.99 instead of 0\.9"):
         Relabelled.load(path, key | {"gamma": 0.9})
 
 
@@ -146,7 +148,11 @@ def checkpoint(skill: SkillModule, path) -> str:
 
 def module(trajectories, skill, folder, **settings) -> RelabeledDataModule:
     return RelabeledDataModule.from_trajectories(
-        trajectories, checkpoint(skill, folder / "skill.ckpt"), validation_fraction=0.3, batch_size=4, **settings
+        trajectories,
+        checkpoint(skill, folder / "skill.ckpt"),
+        validation_fraction=0.3,
+        batch_size=4,
+        **settings,
     )
 
 
@@ -192,7 +198,7 @@ def test_a_relabelled_file_of_another_checkpoint_is_refused(trajectories, skill,
     torch.manual_seed(1)
     other = SkillModule(2, 1, horizon=3, num_skills=4, **SMALL)
     wrong = module(trajectories, other, tmp_path, relabelled=str(first.cache_file()))
-    with pytest.raises(UserError, match="relabelled with other inputs .skill"):
+    with pytest.raises(UserError, match=r"relabelled with other inputs .skill"):
         wrong.setup()
 
 

@@ -31,6 +31,10 @@ def _epoch(loader: TensorLoader) -> list[list[int]]:
     return [batch["index"].tolist() for batch in loader]
 
 
+def _flat(batches: list[list[int]]) -> list[int]:
+    return [item for batch in batches for item in batch]
+
+
 # ---------------------------------------------------------------------- TensorLoader
 
 
@@ -38,7 +42,7 @@ def test_every_item_is_seen_once_an_epoch() -> None:
     loader = _loader()
     batches = _epoch(loader)
     assert [len(batch) for batch in batches] == [5, 5, 5, 5, 3]
-    assert sorted(sum(batches, [])) == list(range(23))
+    assert sorted(_flat(batches)) == list(range(23))
     assert len(loader) == 5
 
 
@@ -66,7 +70,7 @@ def test_iterating_leaves_the_global_generator_alone() -> None:
 
 def test_without_shuffle_the_order_is_that_of_the_items() -> None:
     loader = _loader(shuffle=False)
-    assert sum(_epoch(loader), []) == sum(_epoch(loader), []) == list(range(23))
+    assert _flat(_epoch(loader)) == _flat(_epoch(loader)) == list(range(23))
 
 
 def _take(loader: TensorLoader, count: int) -> list[list[int]]:
@@ -112,7 +116,7 @@ def test_a_state_of_other_data_is_refused() -> None:
 
 
 def test_processes_share_an_epoch_without_overlap() -> None:
-    parts = [sum(_epoch(_loader(rank=rank, world_size=2)), []) for rank in (0, 1)]
+    parts = [_flat(_epoch(_loader(rank=rank, world_size=2))) for rank in (0, 1)]
     assert [len(part) for part in parts] == [11, 11]
     assert len(set(parts[0]) | set(parts[1])) == 22
 
@@ -175,9 +179,7 @@ def test_training_and_validation_share_no_episode(data: Trajectories) -> None:
 
 
 def test_validation_is_the_same_every_time_and_bounded(data: Trajectories) -> None:
-    module = SegmentDataModule.from_trajectories(
-        data, horizon=4, validation_fraction=0.5, max_validation_segments=7
-    )
+    module = SegmentDataModule.from_trajectories(data, horizon=4, validation_fraction=0.5, max_validation_segments=7)
     loader = module.val_dataloader()
     first, second = _batches(loader), _batches(loader)
     assert len(first["actions"]) == 7
@@ -198,9 +200,7 @@ def test_no_validation_when_none_is_asked_for(data: Trajectories) -> None:
 def test_statistics_are_of_the_training_episodes(data: Trajectories) -> None:
     module = SegmentDataModule.from_trajectories(data, horizon=4, validation_fraction=0.3)
     found = module.statistics()
-    rows = np.concatenate([data.episode(e)["observations"] for e in module.training_episodes]).astype(
-        np.float64
-    )
+    rows = np.concatenate([data.episode(e)["observations"] for e in module.training_episodes]).astype(np.float64)
     np.testing.assert_allclose(found["observation_mean"], rows.mean(axis=0), rtol=1e-6)
     np.testing.assert_allclose(found["observation_std"], rows.std(axis=0), rtol=1e-6)
     assert found["action_low"].tolist() == [-1]
@@ -227,9 +227,7 @@ def test_memory_mapped_data_give_the_same_batches(data: Trajectories, tmp_path: 
 def test_the_task_alone_tells_the_shapes_and_how_to_get_data() -> None:
     module = SegmentDataModule(task="pointmaze-large-diverse")
     assert (module.observation_dim, module.action_dim) == (4, 2)
-    with pytest.raises(
-        UserError, match=r"data: none was given for task .*`dds data collect pointmaze-large-diverse"
-    ):
+    with pytest.raises(UserError, match=r"data: none was given for task .*`dds data collect pointmaze-large-diverse"):
         module.setup()
 
 
@@ -296,9 +294,7 @@ def _fit(
 
 @pytest.mark.parametrize("limit", [None, 4])
 @pytest.mark.parametrize("stop", [1, 4, 6, 7, 8, 12])  # 6 batches an epoch: in the middle and at its end
-def test_lightning_resumes_at_the_very_batch(
-    data: Trajectories, tmp_path: Path, stop: int, limit: int | None
-) -> None:
+def test_lightning_resumes_at_the_very_batch(data: Trajectories, tmp_path: Path, stop: int, limit: int | None) -> None:
     whole, _ = _fit(data, tmp_path, 15, limit_train_batches=limit)
     first, trainer = _fit(data, tmp_path, stop, limit_train_batches=limit)
     trainer.save_checkpoint(tmp_path / "at.ckpt")

@@ -128,7 +128,7 @@ def test_the_box_may_differ_by_dimension(make_episode: Make) -> None:
     data = Trajectories.from_episodes("wide", [episode], action_low=[-2, -1], action_high=[2, 1])
     np.testing.assert_array_equal(data.action_high, [2, 1])
     episode["actions"][:, 1] = 1.5
-    with pytest.raises(DataError, match="found 1.5 at step 0, column 1, expected -1 to 1"):
+    with pytest.raises(DataError, match=r"found 1\.5 at step 0, column 1, expected -1 to 1"):
         Trajectories.from_episodes("wide", [episode], action_low=[-2, -1], action_high=[2, 1])
 
 
@@ -141,7 +141,5 @@ def test_flags_of_0_and_1_are_flags(make_episode: Make) -> None:
 def test_the_first_widths_hold_for_all(make_episode: Make) -> None:
     other = make_episode(5)
     other["observations"] = np.zeros((6, 3))
-    with pytest.raises(
-        DataError, match=r"episode 1, observations: found shape \(6, 3\), expected \(steps, 2\)"
-    ):
+    with pytest.raises(DataError, match=r"episode 1, observations: found shape \(6, 3\), expected \(steps, 2\)"):
         Trajectories.from_episodes("mixed", [make_episode(5), other])

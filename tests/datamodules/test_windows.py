@@ -30,10 +30,7 @@ def test_windows_are_those_counted_by_hand(mixed: Trajectories, horizon: int, st
             if h == horizon or (tail == "terminated" and e in (1, 2)):
                 expected.append((mixed.step_offsets[e] + t, mixed.observation_offsets[e] + t, h, e))
     found = mixed.windows(horizon, stride, tail)
-    assert (
-        list(zip(found.starts, found.observation_starts, found.lengths, found.episodes, strict=True))
-        == expected
-    )
+    assert list(zip(found.starts, found.observation_starts, found.lengths, found.episodes, strict=True)) == expected
     assert len(found) == len(expected)
 
 
@@ -59,17 +56,13 @@ def test_short_windows_end_in_a_termination_never_in_a_time_out(mixed: Trajector
 
 
 def test_short_episodes_are_counted_in_one_warning(mixed: Trajectories) -> None:
-    with pytest.warns(
-        UserWarning, match=r"2 of 4 episodes are shorter than horizon 4 .* \(5 of 14 steps\)"
-    ) as seen:
+    with pytest.warns(UserWarning, match=r"2 of 4 episodes are shorter than horizon 4 .* \(5 of 14 steps\)") as seen:
         mixed.windows(4)
     assert len(seen) == 1
 
 
 def test_a_horizon_longer_than_every_episode_is_an_error(mixed: Trajectories) -> None:
-    with pytest.raises(
-        DataError, match=r"horizon 6 is longer than every one of the 4 .* longest has 5 steps"
-    ):
+    with pytest.raises(DataError, match=r"horizon 6 is longer than every one of the 4 .* longest has 5 steps"):
         mixed.windows(6)
 
 

@@ -1,0 +1,108 @@
+"""Resume exactly: Lightning saves no state of the random streams, so this callback does."""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import lightning.pytorch as pl
+import numpy as np
+import torch
+from lightning.pytorch.callbacks import Callback
+
+
+def rng_state() -> dict[str, Any]:
+    """State of the global streams of torch, CUDA, NumPy and Python, as tensors and plain values.
+
+    They are safe to load with `weights_only=True`.
+    """
+    version, words, gauss = random.getstate()
+    name, keys, position, has_gauss, cached = np.random.get_state(legacy=True)
+    return {
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+        "numpy": [
+            str(name),
+            torch.from_numpy(np.asarray(keys).astype(np.int64)),
+            int(position),
+            int(has_gauss),
+            float(cached),
+        ],
+        "python": [version, torch.tensor(words, dtype=torch.int64), gauss],
+    }
+
+
+def set_rng_state(state: dict[str, Any]) -> None:
+    """Set the global streams to what `rng_state` returned."""
+    torch.set_rng_state(state["torch"].cpu())
+    cuda = state["cuda"]
+    if len(cuda) == torch.cuda.device_count():
+        torch.cuda.set_rng_state_all([own.cpu() for own in cuda])
+    elif cuda:
+        warnings.warn(
+            f"the checkpoint has random streams of {len(cuda)} GPUs, here are {torch.cuda.device_count()}: "
+            "training goes on, but not bit for bit as it would have",
+            stacklevel=2,
+        )
+    name, keys, position, has_gauss, cached = state["numpy"]
+    np.random.set_state((name, keys.cpu().numpy().astype(np.uint32), position, has_gauss, cached))
+    version, words, gauss = state["python"]
+    random.setstate((version, tuple(words.tolist()), gauss))
+
+
+@contextlib.contextmanager
+def undisturbed(*modules: torch.nn.Module) -> Iterator[None]:
+    """Put back the global random streams and each module's train or eval mode, whatever happens inside."""
+    state = rng_state()
+    modes = [(part, part.training) for module in modules for part in module.modules()]
+    try:
+        yield
+    finally:
+        for part, mode in modes:
+            part.training = mode  # one by one: frozen parts may be in eval mode inside a module that trains
+        set_rng_state(state)
+
+
+class ExactResume(Callback):
+    """Keep the random streams in every checkpoint and put them back where training goes on.
+
+    With a loader that saves its own place (`TensorLoader`), a run that was stopped after any step and resumed
+    in a new process ends with the same bits as one that never stopped, on a CPU.
+    """
+
+    def __init__(self) -> None:
+        """Nothing to restore yet."""
+        self._states: list[dict[str, Any]] | None = None
+
+    def on_save_checkpoint(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Add the streams of every process to the checkpoint."""
+        states: list[Any] = [rng_state()]
+        if trainer.world_size > 1 and torch.distributed.is_initialized():
+            states = [None] * trainer.world_size
+            torch.distributed.all_gather_object(states, rng_state())
+        checkpoint["rng"] = states
+
+    def on_load_checkpoint(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Keep the streams until training starts: what runs before must not use them up."""
+        self._states = checkpoint.get("rng")
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Put the streams back."""
+        states, self._states = self._states, None
+        if states is None:
+            return
+        if len(states) != trainer.world_size:
+            warnings.warn(
+                f"the checkpoint was made by {len(states)} processes, {trainer.world_size} resume it: "
+                "training goes on, but not bit for bit as it would have",
+                stacklevel=2,
+            )
+            return
+        set_rng_state(states[trainer.global_rank])

@@ -1,0 +1,70 @@
+"""Training curves from the metrics.csv that every fit leaves."""
+
+from pathlib import Path
+
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+PANELS = {
+    "skill": (
+        ("train/denoising", "denoising loss"),
+        ("val/reconstruction_rmse", "reconstruction RMSE (action units)"),
+        ("val/codes_used", "codes in use"),
+        ("train/commitment", "||E - z||$^2$"),
+    ),
+    "policy": (
+        ("train/v_mean", "mean V(s)"),
+        ("train/q_loss", "TD error"),
+        ("train/effective_sample_size", "effective sample size of AWR"),
+        ("val/code_accuracy", "agreement with the data's code"),
+    ),
+}
+
+
+def read_metrics(path: str | Path) -> pd.DataFrame:
+    """Read a metrics.csv, one row a logged step."""
+    return pd.read_csv(path).sort_values("step")
+
+
+def plot_training_curves(stages: dict[str, Path]) -> Figure:
+    """Curves of each stage that has a metrics file, one row of panels a stage.
+
+    Args:
+        stages: "skill" or "policy" to its metrics.csv; missing files are left out.
+    """
+    present = {stage: read_metrics(path) for stage, path in stages.items() if path.is_file()}
+    figure = Figure(figsize=(8.0, 2.1 * max(len(present), 1)), layout="constrained")
+    if not present:
+        figure.text(0.5, 0.5, "no metrics were recorded", ha="center")
+        return figure
+    axes = figure.subplots(len(present), 4, squeeze=False)
+    for row, (stage, table) in zip(axes, present.items(), strict=True):
+        for ax, (column, label) in zip(row, PANELS[stage], strict=True):
+            _curve(ax, table, column, label)
+        row[0].annotate(
+            stage,
+            (-0.42, 0.5),
+            xycoords="axes fraction",
+            rotation=90,
+            va="center",
+            fontsize=9,
+            fontweight="bold",
+        )
+    return figure
+
+
+def _curve(ax: Axes, table: pd.DataFrame, column: str, label: str) -> None:
+    ax.set_title(label, fontsize=7.5)
+    ax.tick_params(labelsize=6.5)
+    ax.set_xlabel("optimiser step", fontsize=6.5)
+    ax.spines[["top", "right"]].set_visible(False)
+    if column in table:
+        points = table[["step", column]].dropna()
+        ax.plot(
+            points["step"],
+            points[column],
+            color="#0072b2",
+            linewidth=1.2,
+            marker="." if len(points) < 12 else "",
+        )

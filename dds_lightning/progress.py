@@ -1,0 +1,105 @@
+"""One line of progress for a whole training: steps, time left, speed and the last logged numbers."""
+
+import sys
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import lightning.pytorch as pl
+from lightning.pytorch.callbacks import ProgressBar
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+from dds_lightning.stages import duration
+
+
+class StepProgress(ProgressBar):
+    """Count optimiser steps towards `max_steps`, across epochs.
+
+    Lightning's own bars count batches of an epoch, which means nothing where an epoch is as long as the data and a
+    training as long as its steps. On a terminal the line is redrawn a few times a second; in a log file a line is
+    written every minute. Metrics are read only then, so that a step never waits for the device.
+
+    Args:
+        metrics: names to show, the first of them that were logged; without their `train/`.
+        log_every_n_seconds: seconds between two lines where standard error is no terminal.
+    """
+
+    def __init__(
+        self,
+        metrics: tuple[str, ...] = ("train/loss", "val/loss", "val/codes_used", "rollout/success"),
+        log_every_n_seconds: float = 60.0,
+    ) -> None:
+        super().__init__()
+        self.metrics = metrics
+        self.log_every_n_seconds = log_every_n_seconds
+        self._progress: Progress | None = None
+        self._line: TaskID | None = None
+        self._enabled = True
+        self._next = self._started = 0.0
+        self._first_step = 0
+
+    def disable(self) -> None:
+        """Show nothing."""
+        self._enabled = False
+
+    def enable(self) -> None:
+        """Show again."""
+        self._enabled = True
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Begin to count."""
+        self._started, self._first_step = time.monotonic(), trainer.global_step
+        self._next = self._started + (0 if self._terminal else self.log_every_n_seconds)
+        if self._enabled and self._terminal and trainer.is_global_zero:
+            self._progress = Progress(
+                TextColumn("  step"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeRemainingColumn(),
+                TextColumn("{task.fields[facts]}"),
+                console=Console(stderr=True),
+                transient=True,
+            )
+            total = trainer.max_steps if trainer.max_steps > 0 else None
+            self._line = self._progress.add_task("", total=total, completed=trainer.global_step, facts="")
+            self._progress.start()
+
+    def on_train_batch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Redraw when it is time."""
+        now = time.monotonic()
+        if now < self._next or not self._enabled or not trainer.is_global_zero:
+            return
+        step = trainer.global_step
+        rate = (step - self._first_step) / max(now - self._started, 1e-9)
+        facts = f"{rate:,.0f} steps/s  " + self._facts(trainer.callback_metrics)
+        if self._progress is not None and self._line is not None:
+            self._progress.update(self._line, completed=step, facts=facts)
+            self._next = now + 0.3
+            return
+        left = f", {duration((trainer.max_steps - step) / max(rate, 1e-9))} left" if trainer.max_steps > 0 else ""
+        print(f"  step {step:,}{left}  {facts}", file=sys.stderr, flush=True)
+        self._next = now + self.log_every_n_seconds
+
+    def _facts(self, logged: Mapping[str, Any]) -> str:
+        shown = [(name, logged[name]) for name in self.metrics if name in logged]
+        return "  ".join(f"{name.removeprefix('train/')} {float(value):.4g}" for name, value in shown)
+
+    def teardown(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
+        """Take the line away."""
+        self._close()
+
+    def on_exception(self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException) -> None:
+        """Take the line away before the message appears."""
+        self._close()
+
+    def _close(self) -> None:
+        if self._progress is not None:
+            self._progress.stop()
+            self._progress = None
+
+    @property
+    def _terminal(self) -> bool:
+        return sys.stderr.isatty()

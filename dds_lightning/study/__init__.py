@@ -1,0 +1,1 @@
+"""What the method is measured against, and how the measurement is told."""

@@ -1,0 +1,127 @@
+"""The text of `report.md`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from dds_lightning.study.tables import BEST, CONTESTANT, SKILL, markdown
+
+if TYPE_CHECKING:
+    from dds_lightning.study.report import Findings
+
+_OTHERS = 3
+"""Commonest ends that are listed for each contestant beside the main one."""
+
+
+def page(found: Findings, files: Mapping[str, str]) -> str:
+    """The report as Markdown.
+
+    Args:
+        found: what it tells.
+        files: name -> file beside it, of those that were made.
+    """
+    parts = [f"# {found.task.name}", _opening(found), _results(found)]
+    if "trajectories" in files:
+        parts.append("## How the policy gets there\n")
+        parts.append(_picture(files, "trajectories", f"{found.main}, coloured by the skill in use."))
+    if "clip" in files:
+        parts.append(_picture(files, "clip", "One episode, the one of median length among the best."))
+    parts.append(_skills(found, files))
+    parts.append(_failures(found, files))
+    if "values" in files:
+        parts.append("## What the critic believes\n")
+        text = (
+            "V for a body at rest. Along the way to the goal it should rise steadily; a dead end that looks "
+            "better than the way out of it is where a policy gets stuck."
+        )
+        parts.append(_picture(files, "values", text))
+    if "training" in files:
+        parts.append("## Training\n")
+        parts.append(_picture(files, "training", "Read from the metrics.csv of both trainings."))
+    parts.append(_run(found))
+    tables = ", ".join(f"[{files[name]}]({files[name]})" for name in ("summary", "failures", "skills"))
+    parts.append(f"Tables: {tables}; every episode is in [evaluate/episodes.parquet](../evaluate/episodes.parquet).")
+    return "\n\n".join(part.strip() for part in parts if part) + "\n"
+
+
+def _opening(found: Findings) -> str:
+    row = found.summary.iloc[0]
+    task = found.task
+    what = "reached the goal" if task.maze_map is not None else "succeeded"
+    text = (
+        f"**{found.main}** {what} in **{row['success']:.1f} %** of {row['episodes']} episodes (95 % interval "
+        f"{row['success_low']:.1f} to {row['success_high']:.1f}), normalised score {row['score']:.1f}"
+    )
+    text += f", median {row['length']:.0f} steps" if row["length"] == row["length"] else ""
+    text += f", at most {task.max_episode_steps} steps an episode, in {task.env_id}"
+    if task.maze_map is not None:
+        text += f" from cell {task.start_cell} to cell {task.goal_cell}"
+    text += "."
+    if task.paper_score is not None:
+        text += f" The paper reports {task.paper_score:.1f}."
+    return text
+
+
+def _results(found: Findings) -> str:
+    from dds_lightning.study.report import readable
+
+    notes = "Intervals are Wilson's. All contestants played from the same starts."
+    if (found.summary["kind"] == BEST).any():
+        each = int(found.summary.loc[found.summary["kind"] == SKILL, "episodes"].iloc[0])
+        notes += f" The best single skill was picked afterwards, from {each} episodes each, which flatters it."
+    table = readable(found.summary)
+    table["contestant"] = [
+        name.strip() if kind == CONTESTANT else f"&nbsp;&nbsp;{name.strip()}"
+        for name, kind in zip(table["contestant"], found.summary["kind"], strict=True)
+    ]
+    return f"## Results\n\n{markdown(table)}\n\n{notes}"
+
+
+def _skills(found: Findings, files: Mapping[str, str]) -> str:
+    formats = {"in data": ".1f", "chosen": ".1f", "alone": ".0f", "dx": ".2f", "dy": ".2f", "distance": ".2f"}
+    headings = {"in data": "in data %", "chosen": "chosen %", "alone": "success alone %"}
+    table = found.skills
+    shown = markdown(table.rename(columns=headings), {headings.get(k, k): v for k, v in formats.items()})
+    text = "## The skills\n\n"
+    if "skills_by_start" in files:
+        text += _picture(files, "skills_by_start", "Every skill alone from several starts.") + "\n\n"
+    if "single_skills" in files:
+        text += _picture(files, "single_skills", "Each skill alone from the task's own start.") + "\n\n"
+    text += shown + f"\n\nChosen: share of the decisions of {found.main}."
+    if "dx" in table:
+        text += " dx, dy and distance: mean change of the first two observations over a segment of the data."
+    return text
+
+
+def _failures(found: Findings, files: Mapping[str, str]) -> str:
+    from dds_lightning.study.report import ends
+
+    mine = found.failures["contestant"] == found.main
+    text = "## Where failed episodes ended\n\n"
+    text += markdown(ends(found.failures[mine])) if mine.any() else f"No episode of {found.main} failed."
+    if "failed_ends" in files:
+        text += "\n\n" + _picture(files, "failed_ends", "Numbers are the skill in use at the end.")
+    others = found.failures[~mine].groupby("contestant", sort=False).head(_OTHERS)
+    if len(others):
+        table = ends(others)
+        table.insert(0, "contestant", others["contestant"].to_numpy())
+        text += f"\n\nThe others, at most {_OTHERS} ends each:\n\n{markdown(table)}"
+    return text
+
+
+def _run(found: Findings) -> str:
+    from dds_lightning.stages import duration
+
+    seconds = [(stage, float(marker.get("seconds", 0.0))) for stage, marker in found.markers.items()]
+    if not seconds:
+        return ""
+    settings = found.markers.get("evaluate", {}).get("settings", {})
+    seed = f", seed {settings['seed']}" if "seed" in settings else ""
+    lines = [f"| {stage} | {duration(spent)} |" for stage, spent in seconds]
+    total = f"| all | {duration(sum(spent for _, spent in seconds))} |"
+    return f"## The run{seed}\n\n" + "\n".join(["| stage | time |", "| --- | --: |", *lines, total])
+
+
+def _picture(files: Mapping[str, str], name: str, text: str) -> str:
+    return f"![{name}]({files[name]})\n\n{text}"

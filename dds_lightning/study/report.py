@@ -1,0 +1,296 @@
+"""A finished run as a person looks at it: the table, figures, a clip and `report.md`, all from the run's files.
+
+```
+ evaluate/episodes.parquet, paths.npz ─┐
+ agent/  relabel/codes.csv             ├─► report/  report.md  *.csv  *.png  episode.gif
+ skill/logs  policy/logs  */stage.json ┘
+```
+
+Nothing is taken from memory, so `report(directory)` draws the same again whenever it is called.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+
+from dds_lightning.errors import UserError
+from dds_lightning.files import written_whole
+from dds_lightning.results import RolloutResult
+from dds_lightning.study.tables import SKILL, cell, failures_table, skills_table, summary_table
+from dds_lightning.tasks import Task, get_task
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from dds_lightning.reports import Report
+
+STAGES = ("data", "skill", "relabel", "policy", "clone", "evaluate")
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """Everything a report tells, read from one run directory.
+
+    Attributes:
+        root: the run directory.
+        task: what was played.
+        result: the evaluation's episodes and paths.
+        main: the contestant the run is about: the published agent as it acts by default.
+        singles: the contestant whose parts are the single skills; None if they did not play.
+        summary: see `tables.summary_table`.
+        failures: see `tables.failures_table`.
+        skills: see `tables.skills_table`.
+        markers: stage -> its marker.
+    """
+
+    root: Path
+    task: Task
+    result: RolloutResult
+    main: str
+    singles: str | None
+    summary: pd.DataFrame
+    failures: pd.DataFrame
+    skills: pd.DataFrame
+    markers: Mapping[str, Mapping[str, Any]]
+
+    @classmethod
+    def read(cls, root: Path) -> Findings:
+        """Read a run directory.
+
+        Raises:
+            UserError: it holds no evaluation, or one of a task that this version does not know.
+        """
+        if not (root / "evaluate" / "episodes.parquet").is_file():
+            raise UserError(
+                f"{root} holds no evaluation (evaluate/episodes.parquet): expected a directory that `dds run` "
+                "has brought at least as far as its stage 'evaluate'"
+            )
+        result = RolloutResult.load(root / "evaluate")
+        episodes = result.episodes
+        task = get_task(result.task)
+        main = str(episodes["actor"].iloc[0])
+        parts = episodes.groupby("actor", sort=False)["label"].nunique()
+        singles = next((str(name) for name in parts.index[parts > 1]), None)
+        usage = root / "relabel" / "codes.csv"
+        return cls(
+            root,
+            task,
+            result,
+            main,
+            singles,
+            summary_table(episodes),
+            failures_table(episodes, task),
+            skills_table(
+                episodes.loc[episodes["actor"] == main, "codes"],
+                pd.read_csv(usage) if usage.is_file() else None,
+                episodes[episodes["actor"] == singles] if singles else None,
+            ),
+            {stage: marker for stage in STAGES if (marker := _marker(root / stage / "stage.json"))},
+        )
+
+
+def _marker(path: Path) -> dict[str, Any]:
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+
+
+# ---------------------------------------------------------------------- writing
+
+
+def write_report(run_dir: str | Path) -> dict[str, Any]:
+    """Write `report/` of a run directory; every file whole or not at all.
+
+    Args:
+        run_dir: a directory of `dds run`, evaluated.
+
+    Returns:
+        Paths of the files by name, and the facts that `told` prints: `task`, `main`, `table`, `failures` (of
+        the main contestant), as plain JSON values.
+
+    Raises:
+        UserError: nothing has been evaluated there, or a file is damaged.
+    """
+    from dds_lightning.reports import plain
+    from dds_lightning.study.page import page
+
+    found = Findings.read(Path(run_dir))
+    folder = found.root / "report"
+    made: dict[str, Path] = {}
+    for name in ("summary", "failures", "skills"):
+        made[name] = folder / f"{name}.csv"
+        with written_whole(made[name]) as part:
+            getattr(found, name).to_csv(part, index=False, lineterminator="\n")
+    made |= _draw(found, folder)
+    text = folder / "report.md"
+    with written_whole(text) as part:
+        part.write_text(page(found, {name: path.name for name, path in made.items()}), encoding="utf-8")
+    failures = found.failures[found.failures["contestant"] == found.main].drop(columns="contestant")
+    facts = {
+        "task": found.task.name,
+        "main": found.main,
+        "table": found.summary.round(4),
+        "failures": failures.astype({"row": object, "column": object}).round(4),
+    }
+    return {"report": text, **made, **_nullable(plain(facts))}
+
+
+def _nullable(value: Any) -> Any:
+    """Missing integers as null."""
+    if isinstance(value, dict):
+        return {key: _nullable(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_nullable(item) for item in value]
+    return None if value is pd.NA else value
+
+
+def report(run_dir: str | Path) -> Report:
+    """Write the report of a run directory once more, and tell what is in it.
+
+    Raises:
+        UserError: as `write_report`.
+    """
+    from dds_lightning.reports import Report
+
+    made = write_report(run_dir)
+    paths = [f"{name}: {path}" for name, path in made.items() if isinstance(path, Path)]
+    return Report(made, [*told(made), *paths])
+
+
+def told(facts: Mapping[str, Any]) -> list[RenderableType]:
+    """The facts of `write_report` for a terminal: the table, and where the main contestant's failures ended."""
+    from dds_lightning.reports import table
+
+    text: list[RenderableType] = [table(readable(pd.DataFrame(facts["table"])), facts["task"])]
+    failures = pd.DataFrame(facts["failures"])
+    if failures.empty:
+        return [*text, f"{facts['main']}: no episode failed"]
+    title = f"{facts['main']}: where {failures['episodes'].sum()} failed episodes ended"
+    return [*text, table(ends(failures), title)]
+
+
+def readable(summary: pd.DataFrame) -> pd.DataFrame:
+    """The summary as it is printed: units in the headings, one text for a rate with its interval."""
+    skill = summary["kind"] == SKILL
+    columns = {
+        "contestant": summary["contestant"].where(~skill, "  " + summary["contestant"]),
+        "episodes": summary["episodes"],
+        "success %": [cell(value, ".1f") for value in summary["success"]],
+        "95 % interval": [
+            f"{low:.1f} to {high:.1f}"
+            for low, high in zip(summary["success_low"], summary["success_high"], strict=True)
+        ],
+        "score": [cell(value, ".1f") for value in summary["score"]],
+        "steps (median, successes)": [cell(value, ".0f") for value in summary["length"]],
+    }
+    return pd.DataFrame(columns)
+
+
+def ends(failures: pd.DataFrame) -> pd.DataFrame:
+    """Failures as they are printed: the cell as one text."""
+    cells = [
+        "-" if pd.isna(row) else f"({row}, {column})"
+        for row, column in zip(failures["row"], failures["column"], strict=True)
+    ]
+    skills = ["-" if code < 0 else str(code) for code in failures["skill"]]
+    shares = [f"{100 * share:.0f} %" for share in failures["share"]]
+    return pd.DataFrame(
+        {
+            "end cell (row, column)": cells,
+            "skill in use": skills,
+            "episodes": failures["episodes"],
+            "share": shares,
+        }
+    )
+
+
+# ---------------------------------------------------------------------- drawing
+
+
+def _draw(found: Findings, folder: Path) -> dict[str, Path]:
+    """Every figure that the run's files and its task allow."""
+    from dds_lightning.interpret import curves
+
+    made: dict[str, Path] = {}
+
+    def keep(name: str, figure: Any) -> None:
+        made[name] = folder / f"{name}.png"
+        with written_whole(made[name]) as part:
+            # Without the version of matplotlib in it, the same picture is the same file.
+            figure.savefig(part, format="png", dpi=150, metadata={"Software": None})
+
+    if found.task.maze_map is not None:
+        _draw_maze(found, folder, keep, made)
+    logs = {stage: path for stage in ("skill", "policy") if (path := _metrics(found.root, stage, folder))}
+    if logs:
+        keep("training", curves.plot_training_curves(logs))
+    return made
+
+
+def _draw_maze(found: Findings, folder: Path, keep: Any, made: dict[str, Path]) -> None:
+    from dds_lightning.interpret import clip, maze
+    from dds_lightning.study.replays import stored_replays
+
+    task, result, main = found.task, found.result, found.main
+    if result.paths:
+        keep("trajectories", maze.plot_trajectories(task, result, main))
+        first = maze.choose_episodes(result, main)[0]
+        made["clip"] = folder / "episode.gif"
+        clip.write_clip(made["clip"], task, result.paths[main, first], main)
+        if found.singles:
+            keep("single_skills", maze.plot_single_skills(task, result, found.singles))
+    keep("failed_ends", maze.plot_failures(task, result, main))
+    agent = found.root / "agent"
+    if (agent / "SHA256SUMS").is_file():
+        replays = stored_replays(folder / "replays.npz", task, agent)
+        keep("skills_by_start", maze.plot_skills_by_start(task, **replays))
+        keep("values", _value_map(found, agent))
+
+
+def _value_map(found: Findings, directory: Path) -> Any:
+    """The published critic over the maze, with the policy's likeliest codes and where the data say they lead."""
+    import numpy as np
+    import torch
+
+    from dds_lightning.agent import DDSAgent
+    from dds_lightning.interpret import maze
+
+    policy = DDSAgent.load(directory).policy
+    assert policy is not None, "a run's agent has a policy"
+
+    @torch.inference_mode()
+    def value(observations: Any) -> Any:
+        return policy.v(torch.from_numpy(observations)).numpy()
+
+    @torch.inference_mode()
+    def codes(observations: Any) -> Any:
+        return policy.codes(torch.from_numpy(observations), selection="greedy").numpy()
+
+    directions = None
+    if "dx" in found.skills:
+        directions = np.nan_to_num(found.skills[["dx", "dy"]].to_numpy())
+    return maze.plot_value_map(found.task, value, codes, directions)
+
+
+def _metrics(root: Path, stage: str, folder: Path) -> Path | None:
+    """One metrics file of a training that may have been interrupted: each launch logged into its own.
+
+    What a launch logged after the step from which the next one went on was lost, and is left out.
+    """
+    folders = sorted((root / stage / "logs").glob("version_*"), key=lambda path: int(path.name.split("_")[1]))
+    launches: list[pd.DataFrame] = []
+    for path in (entry / "metrics.csv" for entry in folders):
+        if not path.is_file() or not path.stat().st_size:
+            continue
+        launch = pd.read_csv(path)
+        launches = [earlier[earlier["step"] < launch["step"].min()] for earlier in launches]
+        launches.append(launch)
+    if not launches:
+        return None
+    with written_whole(folder / f"{stage}_metrics.csv") as part:
+        pd.concat(launches).to_csv(part, index=False, lineterminator="\n")
+    return folder / f"{stage}_metrics.csv"

@@ -1,0 +1,185 @@
+"""From one row an episode to the tables of a report: pure functions, tables in, tables out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from dds_lightning.tasks import Task
+
+SKILL, BEST, CONTESTANT = "skill", "best", "contestant"
+
+
+def wilson(successes: int, episodes: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Wilson's score interval of a success rate (Wilson, 1927), sound also at 0 and at all successes.
+
+    Args:
+        successes: how many.
+        episodes: out of how many.
+        confidence: coverage, for example 0.95.
+
+    Returns:
+        Lower and upper bound in [0, 1]; both NaN without episodes.
+    """
+    if episodes == 0:
+        return math.nan, math.nan
+    z = NormalDist().inv_cdf(0.5 + confidence / 2)
+    rate = successes / episodes
+    denominator = 1.0 + z**2 / episodes
+    centre = rate + z**2 / (2 * episodes)
+    spread = z * math.sqrt(rate * (1.0 - rate) / episodes + z**2 / (4 * episodes**2))
+    # At the ends the bound is exactly 0 or 1; rounding must not say otherwise.
+    low = 0.0 if successes == 0 else (centre - spread) / denominator
+    high = 1.0 if successes == episodes else (centre + spread) / denominator
+    return low, high
+
+
+def summary_table(episodes: pd.DataFrame) -> pd.DataFrame:
+    """One row a contestant; under one of several parts the best of them and each.
+
+    Args:
+        episodes: as in `RolloutResult.episodes`.
+
+    Returns:
+        Columns `contestant` (its name says how codes are chosen), `kind` ("contestant", "best" or "skill"),
+        `episodes`, `success` with `success_low` and `success_high` (per cent; Wilson, 95 %), `score` (mean,
+        normalised) with `score_error` (its standard error), `length` (median steps of successful episodes).
+    """
+    rows = []
+    for actor, played in episodes.groupby("actor", sort=False):
+        labels = list(dict.fromkeys(played["label"]))
+        if len(labels) == 1:
+            rows.append(_row(str(actor), CONTESTANT, played))
+            continue
+        parts = [
+            _row(f"{actor}: {label.removeprefix('skill ')}", SKILL, played[played["label"] == label])
+            for label in labels
+        ]
+        rows.append(_row(f"{actor}, all {len(labels)} together", CONTESTANT, played))
+        best = max(parts, key=_rank)
+        alike = all(_rank(part) == _rank(best) for part in parts)
+        name = "all alike" if alike else best["contestant"].removeprefix(f"{actor}: ")
+        rows.append({**best, "contestant": f"best {actor}: {name}", "kind": BEST})
+        rows += parts
+    return pd.DataFrame(rows)
+
+
+def _row(name: str, kind: str, played: pd.DataFrame) -> dict[str, Any]:
+    count, successes = len(played), int(played["success"].sum())
+    low, high = wilson(successes, count)
+    score = played["score"].to_numpy(dtype=float)
+    return {
+        "contestant": name,
+        "kind": kind,
+        "episodes": count,
+        "success": 100.0 * successes / count,
+        "success_low": 100.0 * low,
+        "success_high": 100.0 * high,
+        "score": float(score.mean()),
+        "score_error": float(score.std(ddof=1) / math.sqrt(count)) if count > 1 else math.nan,
+        "length": float(played.loc[played["success"].astype(bool), "length"].median()),
+    }
+
+
+def _rank(row: Mapping[str, Any]) -> tuple[float, float, float]:
+    """Orders parts: success, then score, then the shorter way."""
+    return row["success"], row["score"], -row["length"] if row["length"] == row["length"] else -math.inf
+
+
+def failures_table(episodes: pd.DataFrame, task: Task) -> pd.DataFrame:
+    """Where failed episodes ended and with which skill, the commonest end first.
+
+    Args:
+        episodes: as in `RolloutResult.episodes`.
+        task: says which cell a position is in.
+
+    Returns:
+        Columns `contestant`, `row` and `column` of the end cell (missing where there is no maze), `skill` in
+        use (-1 without skills), `episodes`, `share` (of the contestant's failures).
+    """
+    failed = episodes.loc[~episodes["success"].astype(bool), ["actor", "final_x", "final_y", "final_code"]]
+    cells = np.full((len(failed), 2), -1, dtype=np.int64)
+    known = failed[["final_x", "final_y"]].notna().all(axis=1).to_numpy()
+    if task.maze_map is not None and known.any():
+        cells[known] = task.xy_to_cell(failed.loc[known, ["final_x", "final_y"]].to_numpy())
+    table = pd.DataFrame(
+        {
+            "contestant": failed["actor"].to_numpy(),
+            "row": cells[:, 0],
+            "column": cells[:, 1],
+            "skill": failed["final_code"].to_numpy(dtype=np.int64),
+        }
+    )
+    keys = ["contestant", "row", "column", "skill"]
+    counted = table.groupby(keys, sort=False).size().rename("episodes").reset_index()
+    counted["share"] = counted["episodes"] / counted.groupby("contestant")["episodes"].transform("sum")
+    order = {name: i for i, name in enumerate(episodes["actor"].unique())}
+    counted["order"] = counted["contestant"].map(order)
+    counted = counted.sort_values(
+        ["order", "episodes", "row", "column", "skill"], ascending=[True, False, True, True, True]
+    )
+    for name in ("row", "column"):
+        counted[name] = counted[name].astype("Int64").mask(counted[name] < 0)
+    return counted.drop(columns="order").reset_index(drop=True)
+
+
+def skills_table(
+    chosen: Iterable[Iterable[int]], data: pd.DataFrame | None, alone: pd.DataFrame | None
+) -> pd.DataFrame:
+    """One row a code: how often the data use it and the policy chooses it, where it leads, what it does alone.
+
+    Args:
+        chosen: the codes of each of the policy's episodes.
+        data: summary of the relabelled data (`relabel/codes.csv`), if there is one.
+        alone: episodes of the single skills (rows of `RolloutResult.episodes`), if they played.
+
+    Returns:
+        Columns `skill`, `in data`, `chosen` (per cent), `dx`, `dy`, `distance` (of a segment, in the
+        observation's units), `alone` (per cent success, or NaN); those without a source are left out.
+    """
+    codes = np.fromiter((code for episode in chosen for code in episode), dtype=np.int64)
+    count = int(codes.max(initial=-1)) + 1
+    if data is not None:
+        count = max(count, int(data["code"].max()) + 1)
+    if alone is not None:
+        count = max(count, int(alone["final_code"].max()) + 1)
+    table = pd.DataFrame({"skill": np.arange(count)})
+    if data is not None:
+        table["in data"] = 100.0 * data.set_index("code")["share"].reindex(table["skill"]).to_numpy()
+    table["chosen"] = 100.0 * np.bincount(codes, minlength=count) / max(len(codes), 1)
+    if data is not None:
+        moves = data.set_index("code").reindex(table["skill"])
+        for name in ("dx", "dy", "distance"):
+            table[name] = moves[name].to_numpy()
+    if alone is not None:
+        rates = alone.groupby("final_code")["success"].mean()
+        table["alone"] = 100.0 * rates.reindex(table["skill"]).to_numpy(dtype=float)
+    return table
+
+
+def markdown(table: pd.DataFrame, formats: Mapping[str, str] | None = None) -> str:
+    """A DataFrame as a Markdown table: numbers to the right, missing values as a dash.
+
+    Args:
+        table: small.
+        formats: column -> format of its numbers, for example ".1f".
+    """
+    formats = formats or {}
+    header = [str(column) for column in table.columns]
+    numeric = [pd.api.types.is_numeric_dtype(table[column]) for column in table.columns]
+    lines = [header, ["--:" if right else "---" for right in numeric]]
+    for row in table.itertuples(index=False):
+        lines.append([cell(value, formats.get(name, "")) for name, value in zip(table.columns, row, strict=True)])
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def cell(value: Any, form: str = "") -> str:
+    """One value as text."""
+    if pd.isna(value):
+        return "-"
+    return format(value, form).replace("|", "\\|") if form else str(value).replace("|", "\\|")
