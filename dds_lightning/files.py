@@ -3,15 +3,28 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import hashlib
 import os
 import secrets
+import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
+STALE_AFTER = 3600.0
+"""Seconds after which an unfinished file belongs to nobody."""
+
 
 def beside(path: Path) -> Path:
-    """A hidden name next to `path` that nobody else uses, for what is not finished yet."""
+    """A hidden name next to `path` that nobody else uses, for what is not finished yet.
+
+    What a kill left under such a name more than an hour ago is removed.
+    """
+    for left in path.parent.glob(f".{glob.escape(path.name)}.{'?' * 8}.part"):
+        with contextlib.suppress(OSError):
+            if time.time() - left.stat().st_mtime > STALE_AFTER:
+                shutil.rmtree(left) if left.is_dir() else left.unlink()
     return path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
 
 

@@ -19,6 +19,7 @@ from jsonargparse import Namespace
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
 from dds_lightning import interrupts
+from dds_lightning.checkpointing import load_ckpt
 from dds_lightning.configs import resolve_configs
 from dds_lightning.errors import UserError
 from dds_lightning.reports import Report, table
@@ -235,14 +236,11 @@ def load_checkpoint(path: str, stage: str) -> dict[str, Any]:
     Raises:
         UserError: no such file, unreadable, or of another kind of model.
     """
-    if not Path(path).is_file():
-        raise UserError(f"--ckpt_path: there is no file {path}")
     try:
-        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        trained = checkpoint["hyper_parameters"]
-    except Exception as error:
-        reason = str(error).split("\n", 1)[0]
-        raise UserError(f"--ckpt_path: {path} is no readable Lightning checkpoint ({reason})") from error
+        checkpoint = load_ckpt(path)
+    except UserError as error:
+        raise UserError(f"--ckpt_path: {error}") from None
+    trained = checkpoint.get("hyper_parameters") or {}
     marks = {"skill": "horizon", "policy": "tau"}
     if marks[stage] not in trained:
         other = next((name for name, mark in marks.items() if mark in trained), "other")

@@ -181,12 +181,8 @@ class Run:
         config = self.settings[stage]
         trainer = {key: value for key, value in config["trainer"].items() if key not in _PLACES}
         data = {key: value for key, value in config["data"].items() if key not in ("data", "skill", "cache")}
-        return {
-            "seed": config["seed_everything"],
-            "trainer": trainer,
-            "model": config["model"],
-            "data": data,
-        } | {"best": best}
+        chosen = {"trainer": trainer, "model": config["model"], "data": data, "best": config["best"]}
+        return {"seed": config["seed_everything"], **chosen}
 
     def _fit(self, stage: str, folder: Path, resuming: bool) -> dict[str, Any]:
         """Run `dds STAGE fit`, from its last checkpoint if there is one."""

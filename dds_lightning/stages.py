@@ -29,6 +29,7 @@ from typing import Any
 from rich.console import Console
 
 from dds_lightning.errors import UserError
+from dds_lightning.files import sha256, written_whole
 
 FORMAT = 1
 MARKER = "stage.json"
@@ -159,15 +160,9 @@ def locked(root: Path) -> Iterator[None]:
 
 def write_json(path: Path, value: Any) -> None:
     """Write JSON so that a reader sees the old file or the new one, and never half of one."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("w", encoding="utf-8") as file:
-            json.dump(value, file, indent=2, allow_nan=False)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    text = json.dumps(value, indent=2, allow_nan=False)
+    with written_whole(path) as part:
+        part.write_text(text, encoding="utf-8")
 
 
 def duration(seconds: float) -> str:
@@ -198,14 +193,10 @@ def _found(folder: Path, marker: dict[str, Any]) -> Done | None:
 
 def _digest(path: Path) -> str:
     """SHA-256 of a file, or of every file under a folder with its name."""
-    digest = hashlib.sha256()
-    files = sorted(entry for entry in path.rglob("*") if entry.is_file()) if path.is_dir() else [path]
-    for entry in files:
-        digest.update(str(entry.relative_to(path)).encode())
-        with entry.open("rb") as file:
-            while block := file.read(1 << 20):
-                digest.update(block)
-    return digest.hexdigest()
+    if path.is_file():
+        return sha256(path)
+    files = sorted(entry for entry in path.rglob("*") if entry.is_file())
+    return _join({str(entry.relative_to(path)): sha256(entry) for entry in files}, {})
 
 
 def _join(files: Mapping[str, str], facts: Mapping[str, Any]) -> str:

@@ -73,7 +73,7 @@ class Task:
     score_min: float = 0.0
     score_max: float = 1.0
     evaluation_episodes: int = 100
-    data_ids: Mapping[str, str] = field(default_factory=dict)
+    data_ids: Mapping[str, str] = field(default_factory=dict, hash=False)
     data_env_ids: tuple[str, ...] = ()
     data_start_cells: tuple[Cell, ...] | None = None
     data_goal_cells: tuple[Cell, ...] | None = None

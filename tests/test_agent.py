@@ -48,9 +48,7 @@ class StatePolicy(nn.Module):
 
 def tiny_modules(seed=0):
     torch.manual_seed(seed)
-    skill = SkillModule(
-        4, 2, horizon=5, num_skills=K, skill_dim=8, hidden_dim=16, encoder_layers=1, encoder_heads=2
-    )
+    skill = SkillModule(4, 2, horizon=5, num_skills=K, skill_dim=8, hidden_dim=16, encoder_layers=1, encoder_heads=2)
     skill.normaliser.fit(torch.arange(4.0), torch.ones(4))
     skill.bottleneck.start_from(torch.randn(64, 8))
     policy = PolicyModule(4, K, hidden_dims=(16,))

@@ -241,7 +241,7 @@ def test_one_actor_cannot_play_twice():
         rollout(TOY, [Contestant("a", actor, 1), Contestant("b", actor, 1)], workers=0)
 
 
-BROKEN = '''
+BROKEN = """
 import os, numpy as np
 class Env:
     def reset(self, seed=None):
@@ -254,7 +254,7 @@ class Env:
 class Task:
     name, observation_dim, action_dim, max_episode_steps = "broken", 1, 1, 5
     def make_env(self): return Env()
-'''
+"""
 
 
 @pytest.fixture

@@ -26,6 +26,9 @@ class BehaviourNoise:
         action_noise: Standard deviation of the Gaussian noise on every action entry.
         burst_probability: Chance that a step outside a burst starts one.
         burst_steps: Shortest and longest burst.
+        rest_share: Share of the bursts in which the body brakes and stays at rest. An agent starts at rest
+            and comes to rest wherever it pushes against a wall; a policy that has seen few such states
+            repeats a useless push.
         start_offset: Episodes start up to this far from a cell's centre, in cells, at rest.
     """
 
@@ -33,6 +36,7 @@ class BehaviourNoise:
     action_noise: float = 0.2
     burst_probability: float = 0.008
     burst_steps: tuple[int, int] = (10, 50)
+    rest_share: float = 0.4
     start_offset: float = 0.38
 
     def __post_init__(self) -> None:
@@ -45,6 +49,8 @@ class BehaviourNoise:
             raise UserError(f"action_noise: found {self.action_noise}, expected a number of at least 0")
         if not 0.0 <= self.burst_probability <= 1.0:
             raise UserError(f"burst_probability: found {self.burst_probability}, expected 0 to 1")
+        if not 0.0 <= self.rest_share <= 1.0:
+            raise UserError(f"rest_share: found {self.rest_share}, expected 0 to 1")
         low, high = self.burst_steps
         if not 1 <= low <= high:
             raise UserError(f"burst_steps: found {self.burst_steps}, expected 1 <= shortest <= longest")
@@ -52,6 +58,9 @@ class BehaviourNoise:
 
 QUIET = BehaviourNoise(waypoint_offset=0.0, action_noise=0.0, burst_probability=0.0, start_offset=0.0)
 """No noise at all: the controller at its best."""
+
+REST = (0.0, 0.0)
+"""Stands in a plan of bursts for braking, whose force depends on the velocity."""
 
 
 class Driver:
@@ -96,6 +105,8 @@ class Driver:
         step = self._step if self._step < len(self._noise) else 0
         self._step = step + 1
         burst = self._burst[step]
+        if burst is REST:
+            return min(max(-self.gain * vx, -1.0), 1.0), min(max(-self.gain * vy, -1.0), 1.0)
         if burst is not None:
             return burst
         cell, aim = self._index(x, y), self._index(*goal)
@@ -115,7 +126,8 @@ class Driver:
 def _bursts(rng: np.random.Generator, steps: int, noise: BehaviourNoise) -> list[tuple[float, float] | None]:
     """Steps of an episode at which a random action replaces the controller's, and that action.
 
-    Half of the bursts hold one force (they press the body against walls), half draw a new one at every step.
+    A share of `rest_share` brings the body to rest; of the others half hold one force (they press the body
+    against walls) and half draw a new one at every step.
     """
     plan: list[tuple[float, float] | None] = [None] * steps
     if noise.burst_probability <= 0:
@@ -127,7 +139,8 @@ def _bursts(rng: np.random.Generator, steps: int, noise: BehaviourNoise) -> list
         forces = rng.uniform(-1.0, 1.0, (length, 2))
         if rng.random() < 0.5:
             forces[:] = forces[0]
+        rest = rng.random() < noise.rest_share
         for k, (fx, fy) in enumerate(forces.tolist()[: steps - step]):
-            plan[step + k] = (fx, fy)
+            plan[step + k] = REST if rest else (fx, fy)
         step += length + int(rng.geometric(noise.burst_probability)) - 1
     return plan

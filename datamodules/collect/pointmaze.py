@@ -5,9 +5,11 @@ from __future__ import annotations
 import copy
 import multiprocessing
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from importlib import metadata as installed
 from pathlib import Path
 from typing import Any
@@ -40,6 +42,7 @@ def collect_pointmaze(
     action_noise: float = 0.2,
     burst_probability: float = 0.008,
     burst_steps: tuple[int, int] = (10, 50),
+    rest_share: float = 0.4,
     start_offset: float = 0.38,
     dataset_id: str | None = None,
     overwrite: bool = False,
@@ -64,6 +67,7 @@ def collect_pointmaze(
         action_noise: Standard deviation of the Gaussian noise on actions.
         burst_probability: Chance a step that a burst of random action starts.
         burst_steps: Shortest and longest burst.
+        rest_share: Share of the bursts in which the body brakes and stays at rest.
         start_offset: Episodes start at rest up to this many cells from a cell's centre.
         dataset_id: Name of the set; None takes the task's own, for example "pointmaze-large-diverse-v0".
         overwrite: Replace a set of the same name.
@@ -88,7 +92,12 @@ def collect_pointmaze(
     if not 0 < speed <= 5:
         raise UserError(f"speed: found {speed}, expected more than 0 and at most 5 metres a second")
     noise = BehaviourNoise(
-        waypoint_offset, action_noise, burst_probability, (burst_steps[0], burst_steps[1]), start_offset
+        waypoint_offset=waypoint_offset,
+        action_noise=action_noise,
+        burst_probability=burst_probability,
+        burst_steps=(burst_steps[0], burst_steps[1]),
+        rest_share=rest_share,
+        start_offset=start_offset,
     )
     name = dataset_id or task.data_ids["minari"]
     refuse_existing(Path(out) / name, overwrite)
@@ -231,6 +240,11 @@ def _in_parallel(recorder: _Recorder, workers: int) -> Iterator[dict[str, Any]]:
     try:
         for parcel in pool.map(_record, range(0, recorder.episodes, _EPISODES_A_PARCEL)):
             yield from parcel
+    except (BrokenProcessPool, ConnectionError, EOFError) as error:
+        raise UserError(
+            "workers: a collecting process died; a script must call this under `if __name__ == '__main__':`, "
+            "and workers=1 needs no other processes"
+        ) from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
@@ -240,6 +254,7 @@ _kept: _Recorder | None = None
 
 def _keep(recorder: _Recorder) -> None:
     global _kept
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     _kept = recorder
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from dds_lightning.study.tables import BEST, CONTESTANT, SKILL, markdown
+from dds_lightning.study.tables import BEST, CONTESTANT, SKILL, ends, markdown, readable
 
 if TYPE_CHECKING:
     from dds_lightning.study.report import Findings
@@ -64,8 +64,6 @@ def _opening(found: Findings) -> str:
 
 
 def _results(found: Findings) -> str:
-    from dds_lightning.study.report import readable
-
     notes = "Intervals are Wilson's. All contestants played from the same starts."
     if (found.summary["kind"] == BEST).any():
         each = int(found.summary.loc[found.summary["kind"] == SKILL, "episodes"].iloc[0])
@@ -95,8 +93,6 @@ def _skills(found: Findings, files: Mapping[str, str]) -> str:
 
 
 def _failures(found: Findings, files: Mapping[str, str]) -> str:
-    from dds_lightning.study.report import ends
-
     mine = found.failures["contestant"] == found.main
     text = "## Where failed episodes ended\n\n"
     text += markdown(ends(found.failures[mine])) if mine.any() else f"No episode of {found.main} failed."

@@ -22,7 +22,7 @@ import pandas as pd
 from dds_lightning.errors import UserError
 from dds_lightning.files import written_whole
 from dds_lightning.results import RolloutResult
-from dds_lightning.study.tables import SKILL, cell, failures_table, skills_table, summary_table
+from dds_lightning.study.tables import ends, failures_table, readable, skills_table, summary_table
 from dds_lightning.tasks import Task, get_task
 
 if TYPE_CHECKING:
@@ -134,18 +134,9 @@ def write_report(run_dir: str | Path) -> dict[str, Any]:
         "task": found.task.name,
         "main": found.main,
         "table": found.summary.round(4),
-        "failures": failures.astype({"row": object, "column": object}).round(4),
+        "failures": failures.round(4).astype(object).where(failures.notna(), None),
     }
-    return {"report": text, **made, **_nullable(plain(facts))}
-
-
-def _nullable(value: Any) -> Any:
-    """Missing integers as null."""
-    if isinstance(value, dict):
-        return {key: _nullable(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_nullable(item) for item in value]
-    return None if value is pd.NA else value
+    return {"report": text, **made, **plain(facts)}
 
 
 def report(run_dir: str | Path) -> Report:
@@ -171,41 +162,6 @@ def told(facts: Mapping[str, Any]) -> list[RenderableType]:
         return [*text, f"{facts['main']}: no episode failed"]
     title = f"{facts['main']}: where {failures['episodes'].sum()} failed episodes ended"
     return [*text, table(ends(failures), title)]
-
-
-def readable(summary: pd.DataFrame) -> pd.DataFrame:
-    """The summary as it is printed: units in the headings, one text for a rate with its interval."""
-    skill = summary["kind"] == SKILL
-    columns = {
-        "contestant": summary["contestant"].where(~skill, "  " + summary["contestant"]),
-        "episodes": summary["episodes"],
-        "success %": [cell(value, ".1f") for value in summary["success"]],
-        "95 % interval": [
-            f"{low:.1f} to {high:.1f}"
-            for low, high in zip(summary["success_low"], summary["success_high"], strict=True)
-        ],
-        "score": [cell(value, ".1f") for value in summary["score"]],
-        "steps (median, successes)": [cell(value, ".0f") for value in summary["length"]],
-    }
-    return pd.DataFrame(columns)
-
-
-def ends(failures: pd.DataFrame) -> pd.DataFrame:
-    """Failures as they are printed: the cell as one text."""
-    cells = [
-        "-" if pd.isna(row) else f"({row}, {column})"
-        for row, column in zip(failures["row"], failures["column"], strict=True)
-    ]
-    skills = ["-" if code < 0 else str(code) for code in failures["skill"]]
-    shares = [f"{100 * share:.0f} %" for share in failures["share"]]
-    return pd.DataFrame(
-        {
-            "end cell (row, column)": cells,
-            "skill in use": skills,
-            "episodes": failures["episodes"],
-            "share": shares,
-        }
-    )
 
 
 # ---------------------------------------------------------------------- drawing

@@ -162,6 +162,41 @@ def skills_table(
     return table
 
 
+def readable(summary: pd.DataFrame) -> pd.DataFrame:
+    """The summary as it is printed: units in the headings, one text for a rate with its interval."""
+    skill = summary["kind"] == SKILL
+    columns = {
+        "contestant": summary["contestant"].where(~skill, "  " + summary["contestant"]),
+        "episodes": summary["episodes"],
+        "success %": [cell(value, ".1f") for value in summary["success"]],
+        "95 % interval": [
+            f"{low:.1f} to {high:.1f}"
+            for low, high in zip(summary["success_low"], summary["success_high"], strict=True)
+        ],
+        "score": [cell(value, ".1f") for value in summary["score"]],
+        "steps (median, successes)": [cell(value, ".0f") for value in summary["length"]],
+    }
+    return pd.DataFrame(columns)
+
+
+def ends(failures: pd.DataFrame) -> pd.DataFrame:
+    """Failures as they are printed: the cell as one text."""
+    cells = [
+        "-" if pd.isna(row) else f"({row}, {column})"
+        for row, column in zip(failures["row"], failures["column"], strict=True)
+    ]
+    skills = ["-" if code < 0 else str(code) for code in failures["skill"]]
+    shares = [f"{100 * share:.0f} %" for share in failures["share"]]
+    return pd.DataFrame(
+        {
+            "end cell (row, column)": cells,
+            "skill in use": skills,
+            "episodes": failures["episodes"],
+            "share": shares,
+        }
+    )
+
+
 def markdown(table: pd.DataFrame, formats: Mapping[str, str] | None = None) -> str:
     """A DataFrame as a Markdown table: numbers to the right, missing values as a dash.
 

@@ -2,6 +2,10 @@ from __future__ import annotations
 
 import os
 import re
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -150,7 +154,7 @@ def test_the_data_press_against_walls_and_come_to_rest(large: Path) -> None:
     assert (from_centre.max(axis=1) > 0.38).any()
     speed = np.linalg.norm(states[:, 2:], axis=1)
     assert 2.5 < np.median(speed) < 5
-    assert (speed < 0.5).any()
+    assert (speed < 0.05).mean() > 0.005
 
 
 def test_what_was_collected_loads_for_its_task_only(large: Path) -> None:
@@ -191,6 +195,40 @@ def test_an_interrupted_collection_leaves_nothing(tmp_path: Path, monkeypatch: p
     assert list(tmp_path.iterdir()) == []
 
 
+def _script(tmp_path: Path, body: str) -> Path:
+    script = tmp_path / "script.py"
+    script.write_text(f"from datamodules import collect_pointmaze\n{body}\n")
+    return script
+
+
+def test_ctrl_c_with_many_processes_leaves_nothing(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    call = f"collect_pointmaze({LARGE!r}, 2_000_000, 0, {str(out)!r}, workers=2, progress=False)"
+    script = _script(tmp_path, f"if __name__ == '__main__':\n    {call}")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    process = subprocess.Popen([sys.executable, script], env=environment, start_new_session=True)
+    deadline = time.monotonic() + 60
+    while not (out.is_dir() and any(out.glob(".*/data/main_data.hdf5"))):
+        assert time.monotonic() < deadline
+        assert process.poll() is None
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)
+    assert process.wait(timeout=60) != 0
+    assert list(out.iterdir()) == []
+
+
+def test_a_script_without_a_guard_is_told_so(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    script = _script(tmp_path, f"collect_pointmaze({LARGE!r}, 5_000, 0, {str(out)!r}, workers=2, progress=False)")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    run = subprocess.run(
+        [sys.executable, script], env=environment, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert run.returncode != 0
+    assert "a script must call this under `if __name__ == '__main__':`" in run.stderr
+    assert list(out.iterdir()) == []
+
+
 def test_an_existing_set_is_kept_unless_overwriting(tmp_path: Path) -> None:
     first = collect_pointmaze(LARGE, 20, 0, tmp_path, workers=1, progress=False)
     with pytest.raises(UserError, match="exists already"):
@@ -217,6 +255,7 @@ def test_progress_counts_steps_on_standard_error(tmp_path: Path, capfd: pytest.C
         ({"waypoint_offset": 0.5}, "waypoint_offset: found 0.5, expected 0 to 0.4"),
         ({"start_offset": -0.1}, "start_offset: found -0.1"),
         ({"action_noise": float("nan")}, "action_noise: found nan"),
+        ({"rest_share": 1.5}, r"rest_share: found 1\.5, expected 0 to 1"),
         ({"burst_probability": 2.0}, "burst_probability: found 2.0"),
         ({"burst_steps": (50, 10)}, r"burst_steps: found \(50, 10\)"),
         ({"task": "pointmaze-giant"}, "no task 'pointmaze-giant'"),

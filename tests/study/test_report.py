@@ -1,0 +1,183 @@
+"""A report is drawn from the run's files alone, and twice the same."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from dds_lightning.agent import DDSAgent
+from dds_lightning.errors import UserError
+from dds_lightning.policy import PolicyModule
+from dds_lightning.results import RolloutPath, RolloutResult
+from dds_lightning.skill import SkillModule
+from dds_lightning.study import report as report_module
+from dds_lightning.study.replays import junctions, replay_skills
+from dds_lightning.study.report import report, told, write_report
+from dds_lightning.tasks import get_task
+
+TASK = get_task("pointmaze-umaze-diverse")
+SKILLS = 2
+
+
+def result() -> RolloutResult:
+    """The policy fails one of four episodes in the start cell; each skill alone plays twice and fails."""
+    rows, paths = [], {}
+    random = np.random.default_rng(0)
+
+    def play(actor, label, episode, success, code):
+        length = 40 + episode
+        end = TASK.goal_xy() if success else TASK.start_xy()
+        line = np.linspace(TASK.start_xy(), end, length + 1) + 0.05 * random.standard_normal((length + 1, 2))
+        codes = np.full(length, code, np.int16)
+        rows.append(
+            {
+                "actor": actor,
+                "label": label,
+                "episode": episode,
+                "seed": episode,
+                "return": float(success),
+                "score": 100.0 * success,
+                "success": success,
+                "terminated": success,
+                "length": length,
+                "final_x": float(end[0]),
+                "final_y": float(end[1]),
+                "final_code": code,
+                "codes": [code] * (length // 10) if code >= 0 else [],
+            }
+        )
+        paths[actor, episode] = RolloutPath(line.astype(np.float32), codes)
+
+    for episode in range(4):
+        play("AWR policy, sampled", "AWR policy, sampled", episode, episode != 2, episode % SKILLS)
+    for episode in range(4):
+        play("single skill", f"skill {episode % SKILLS}", episode, False, episode % SKILLS)
+    for episode in range(4):
+        play("behaviour cloning", "behaviour cloning", episode, False, -1)
+    return RolloutResult(TASK.name, pd.DataFrame(rows), paths)
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A run directory as `dds run` leaves it, made without training."""
+    root = tmp_path / "run"
+    result().save(root / "evaluate")
+    torch.manual_seed(0)
+    sizes = {"hidden_dim": 8, "encoder_layers": 1, "encoder_heads": 2, "decoder_blocks": 1, "skill_dim": 4}
+    skill = SkillModule(4, 2, num_skills=SKILLS, horizon=5, **sizes)
+    policy = PolicyModule(4, SKILLS, hidden_dims=[8])
+    policy.support_mask.fill_(True)
+    DDSAgent(skill, policy).save(root / "agent")
+    (root / "relabel").mkdir()
+    codes = {"code": [0, 1], "share": [0.75, 0.25], "dx": [0.5, -0.1], "dy": [0.0, 0.2], "distance": [0.6, 0.4]}
+    pd.DataFrame(codes).to_csv(root / "relabel" / "codes.csv", index=False)
+    for launch, steps in enumerate(([0, 50, 100], [60, 110])):
+        folder = root / "skill" / "logs" / f"version_{launch}"
+        folder.mkdir(parents=True)
+        frame = pd.DataFrame({"step": steps, "train/denoising": [10.0 * launch + s for s in steps]})
+        frame.to_csv(folder / "metrics.csv", index=False)
+    marker = {"seconds": 65.0, "settings": {"seed": 3}}
+    (root / "evaluate" / "stage.json").write_text(json.dumps(marker))
+    return root
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+def test_the_report_twice_is_the_same_to_the_byte(run):
+    first = write_report(run)
+    before = contents(run / "report")
+    second = write_report(run)
+    assert first == second
+    assert contents(run / "report") == before
+    assert not [name for name in before if name.startswith(".")]
+
+
+def test_every_file_of_a_maze_report_is_there_and_linked(run):
+    made = write_report(run)
+    text = made["report"].read_text()
+    pictures = {"trajectories", "clip", "single_skills", "failed_ends", "skills_by_start", "values", "training"}
+    assert pictures <= made.keys()
+    for name in pictures:
+        assert made[name].stat().st_size > 1000
+        assert f"]({made[name].name})" in text
+    assert made["clip"].stat().st_size < 1_500_000
+    assert "**75.0 %** of 4 episodes" in text
+    assert "seed 3" in text
+    assert "1 min 5 s" in text
+    assert str(run) not in text
+
+
+def test_facts_are_plain_json_and_say_where_the_main_contestant_failed(run):
+    made = write_report(run)
+    facts = {name: made[name] for name in ("task", "main", "table", "failures")}
+    assert json.loads(json.dumps(facts, allow_nan=False)) == facts
+    row, column = TASK.start_cell
+    assert facts["failures"] == [{"row": row, "column": column, "skill": 0, "episodes": 1, "share": 1.0}]
+    assert [entry["success"] for entry in facts["table"]] == [75.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+
+
+def test_the_terminal_shows_the_table_and_every_path(run, capsys):
+    told_to_people = report(run)
+    told_to_people.print(as_json=False)
+    out = capsys.readouterr().out
+    assert "AWR policy, sampled" in out
+    assert "30.1 to 95.4" in out
+    assert f"({TASK.start_cell[0]}, {TASK.start_cell[1]})" in out
+    assert str(run / "report" / "report.md") in out
+    told_to_people.print(as_json=True)
+    assert json.loads(capsys.readouterr().out)["main"] == "AWR policy, sampled"
+
+
+def test_facts_read_back_from_a_marker_are_told_alike(run):
+    made = write_report(run)
+    facts = {name: made[name] for name in ("task", "main", "table", "failures")}
+    assert len(told(json.loads(json.dumps(facts)))) == 2
+
+
+def test_what_a_killed_launch_logged_too_much_is_left_out(run, tmp_path):
+    path = report_module._metrics(run, "skill", tmp_path)
+    table = pd.read_csv(path)
+    assert table["step"].tolist() == [0, 50, 60, 110]
+    assert table["train/denoising"].tolist() == [0.0, 50.0, 70.0, 120.0]
+
+
+def test_a_task_without_a_maze_has_tables_and_no_maze_figures(run, monkeypatch):
+    plain_task = dataclasses.replace(TASK, maze_map=None, start_cell=None, goal_cell=None)
+    monkeypatch.setattr(report_module, "get_task", lambda name: plain_task)
+    made = write_report(run)
+    assert made.keys() & {"trajectories", "clip", "values", "failed_ends"} == set()
+    assert made["failures"][0]["row"] is None
+    assert "training" in made
+
+
+def test_without_paths_agent_or_logs_the_rest_is_still_told(tmp_path):
+    dataclasses.replace(result(), paths={}).save(tmp_path / "evaluate")
+    made = write_report(tmp_path)
+    assert {"report", "summary", "failed_ends"} <= made.keys()
+    assert made.keys() & {"trajectories", "values", "training"} == set()
+
+
+def test_a_directory_without_an_evaluation_is_refused_and_left_alone(tmp_path):
+    with pytest.raises(UserError, match="holds no evaluation"):
+        write_report(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_replays_begin_in_their_cells_and_stay_in_the_maze(run):
+    agent = DDSAgent.load(run / "agent")
+    arrays = replay_skills(TASK, agent, steps=7)
+    cells = junctions(TASK)
+    assert cells[0] == TASK.start_cell
+    assert len(set(cells)) == len(cells) == 7  # every free cell of the small maze
+    assert arrays["positions"].shape == (7 * SKILLS, 8, 2)
+    assert arrays["codes"].tolist() == [0] * 7 + [1] * 7
+    np.testing.assert_array_equal(TASK.xy_to_cell(arrays["positions"][:, 0]), list(cells) * SKILLS)
+    np.testing.assert_array_equal(TASK.xy_to_cell(arrays["starts"]), list(cells) * SKILLS)
+    np.testing.assert_array_equal(np.isnan(arrays["positions"][:, 1:, 0]), ~arrays["alive"])
+    again = replay_skills(TASK, agent, steps=7)
+    np.testing.assert_array_equal(arrays["positions"], again["positions"])
