@@ -13,7 +13,7 @@ skill was not carried through, and nothing ended.
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -82,6 +82,12 @@ class Relabelled:
             "dones": self.dones[index],
         }
 
+    def to(self, device: torch.device) -> "Relabelled":
+        """The same transitions on another device."""
+        if self.codes.device == device:
+            return self
+        return replace(self, **{name: getattr(self, name).to(device) for name in _STORED})
+
     def summary(self) -> pd.DataFrame:
         """One row a code: share of the data, mean reward, mean displacement of the first two observations.
 
@@ -117,9 +123,7 @@ class Relabelled:
             "key": json.dumps(key, sort_keys=True),
         }
         with written_whole(Path(path)) as part:
-            save_file(
-                {name: getattr(self, name).contiguous().cpu() for name in _STORED}, part, metadata=metadata
-            )
+            save_file({name: getattr(self, name).contiguous().cpu() for name in _STORED}, part, metadata=metadata)
 
     @classmethod
     def load(cls, path: str | Path, key: dict[str, str | int | float] | None = None) -> "Relabelled":
@@ -139,18 +143,14 @@ class Relabelled:
         except FileNotFoundError:
             raise UserError(f"there is no relabelled file {path}: make it with `dds relabel`") from None
         except Exception as error:
-            raise UserError(
-                f"{path} is no readable relabelled file ({error}): delete it and relabel"
-            ) from error
+            raise UserError(f"{path} is no readable relabelled file ({error}): delete it and relabel") from error
         if metadata.get("format") != str(FORMAT):
             raise UserError(
                 f"{path} has relabelling format {metadata.get('format')!r}, this version reads {FORMAT}: relabel"
             )
         found = json.loads(metadata["key"])
         if key is not None and found != json.loads(json.dumps(key)):
-            pairs = {
-                name: (found.get(name), value) for name, value in key.items() if found.get(name) != value
-            }
+            pairs = {name: (found.get(name), value) for name, value in key.items() if found.get(name) != value}
             wrong = [f"{name} {there!r} instead of {wanted!r}" for name, (there, wanted) in pairs.items()]
             raise UserError(
                 f"{path} was relabelled with other inputs ({'; '.join(wrong)}): choose another file or relabel"
@@ -220,9 +220,7 @@ def relabel(
     horizon = skill.horizon
     windows = trajectories.windows(horizon, stride, tail="terminated")
     starts, observation_starts, lengths = windows.starts, windows.observation_starts, windows.lengths
-    steps = np.minimum(
-        np.arange(horizon), lengths[:, None] - 1
-    )  # (M, H): a short segment repeats its last step
+    steps = np.minimum(np.arange(horizon), lengths[:, None] - 1)  # (M, H): a short segment repeats its last step
     device = skill.device
 
     codes = []

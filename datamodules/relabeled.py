@@ -1,5 +1,7 @@
 """The semi-MDP transitions as a data module: relabel once, keep the result on disk, serve batches from memory."""
 
+import hashlib
+import json
 import logging
 from functools import cached_property
 from pathlib import Path
@@ -43,6 +45,8 @@ class RelabeledDataModule(pl.LightningDataModule):
         device_resident: keep the transitions on the accelerator.
     """
 
+    hparams: Any  # Lightning gives its settings as attributes, but types them as a mapping
+
     def __init__(
         self,
         task: str | None = None,
@@ -64,9 +68,7 @@ class RelabeledDataModule(pl.LightningDataModule):
         self.save_hyperparameters()
         self.task: Task | None = get_task(task) if task else None
         if skill is None:
-            raise UserError(
-                "data.skill is missing: give the skill checkpoint (.ckpt or directory) to relabel with"
-            )
+            raise UserError("data.skill is missing: give the skill checkpoint (.ckpt or directory) to relabel with")
         if not 0.0 <= validation_fraction < 1.0:
             raise UserError(f"data.validation_fraction is {validation_fraction}, expected a share in [0, 1)")
         self.skill = SkillModule.load(skill)
@@ -76,9 +78,7 @@ class RelabeledDataModule(pl.LightningDataModule):
         self._given: Trajectories | None = None
 
     @classmethod
-    def from_trajectories(
-        cls, trajectories: Trajectories, skill: str, **settings: Any
-    ) -> "RelabeledDataModule":
+    def from_trajectories(cls, trajectories: Trajectories, skill: str, **settings: Any) -> "RelabeledDataModule":
         """Build the module over trajectories already in memory."""
         module = cls(skill=skill, **settings)
         module._given = trajectories
@@ -111,15 +111,10 @@ class RelabeledDataModule(pl.LightningDataModule):
 
     def cache_file(self) -> Path:
         """Where the relabelled data of exactly these inputs lie."""
-        import hashlib
-        import json
-
         key = relabel_key(self.trajectories, self.skill, **self.settings)
         name = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:16]
         skill = Path(self.hparams.skill)
-        folder = (
-            Path(self.hparams.cache) if self.hparams.cache else (skill if skill.is_dir() else skill.parent)
-        )
+        folder = Path(self.hparams.cache) if self.hparams.cache else (skill if skill.is_dir() else skill.parent)
         return folder / f"relabelled-{name}.safetensors"
 
     def prepare_data(self) -> None:
@@ -158,27 +153,35 @@ class RelabeledDataModule(pl.LightningDataModule):
             "max_discount": t.discounts[i].max().item(),
         }
 
-    def _loader(self, index: Tensor, shuffle: bool) -> TensorLoader:
+    def _loader(self, index: Tensor, train: bool = False) -> TensorLoader:
         assert self.transitions is not None, "setup() comes first"
-        transitions = self.transitions
+        trainer = self.trainer
+        device = torch.device("cpu")
+        if self.hparams.device_resident and trainer is not None:
+            device = trainer.strategy.root_device
+        transitions, rows = self.transitions.to(device), index.to(device)
 
-        def gather(rows: Tensor) -> dict[str, Tensor]:
-            return transitions.batch(index[rows])
+        def gather(chosen: Tensor) -> dict[str, Tensor]:
+            return transitions.batch(rows[chosen])
 
         h = self.hparams
-        return TensorLoader(gather, len(index), h.batch_size, shuffle=shuffle, seed=h.seed, drop_last=shuffle)
+        options: dict[str, Any] = {"device": device}
+        if train:
+            rank, world = (trainer.global_rank, trainer.world_size) if trainer is not None else (0, 1)
+            options |= {"shuffle": True, "seed": h.seed, "drop_last": True, "rank": rank, "world_size": world}
+        return TensorLoader(gather, len(index), h.batch_size, **options)
 
     def train_dataloader(self) -> TensorLoader:
         """Shuffled batches; the order is a function of seed and epoch."""
-        return self._loader(self.train_index, shuffle=True)
+        return self._loader(self.train_index, train=True)
 
-    def val_dataloader(self) -> TensorLoader:
-        """The held-out episodes' transitions, in order."""
-        return self._loader(self.validation_index, shuffle=False)
+    def val_dataloader(self) -> TensorLoader | list[Any]:
+        """The held-out episodes' transitions, in order; none when ``validation_fraction`` is 0."""
+        return self._loader(self.validation_index) if len(self.validation_index) else []
 
     test_dataloader = val_dataloader
 
     def predict_dataloader(self) -> TensorLoader:
         """Every transition, in order."""
         assert self.transitions is not None, "setup() comes first"
-        return self._loader(torch.arange(len(self.transitions)), shuffle=False)
+        return self._loader(torch.arange(len(self.transitions)))

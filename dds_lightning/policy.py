@@ -61,6 +61,7 @@ class PolicyModule(pl.LightningModule):
         UserError: a setting outside its range; the message names it.
     """
 
+    hparams: Any  # Lightning gives its settings as attributes, but types them as a mapping
     support_mask: Tensor
     value_range: Tensor
 
@@ -101,6 +102,7 @@ class PolicyModule(pl.LightningModule):
         self.target_critic.load_state_dict(self.critic.state_dict())
         self.target_critic.requires_grad_(False)
         self.actor = MLP(width, num_skills, hidden_dims)
+        self.terms: dict[str, Tensor] = {}  # of the last training step, for whoever asks what went wrong
         # Which codes the data support, and what values its rewards and discounts allow; filled at the fit's start.
         self.register_buffer("support_mask", torch.ones(num_skills, dtype=torch.bool))
         self.register_buffer("value_range", torch.tensor([-torch.inf, torch.inf]))
@@ -201,9 +203,7 @@ class PolicyModule(pl.LightningModule):
         q_loss = losses.td(q, target)
         return value_loss + q_loss, {"value_loss": value_loss, "q_loss": q_loss}
 
-    def actor_loss(
-        self, features: Tensor, advantages: Tensor, codes: Tensor
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    def actor_loss(self, features: Tensor, advantages: Tensor, codes: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Equation 9: regression on the codes of the data, weighted by exp(alpha A); (B, F), (B,), (B,)."""
         h = self.hparams
         weights = losses.awr_weights(advantages.detach(), h.alpha, h.weight_clip)
@@ -280,11 +280,11 @@ class PolicyModule(pl.LightningModule):
 
     def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """One optimiser step's loss."""
-        total, info = self.loss(batch)
+        total, self.terms = self.loss(batch)
         if self.global_step % self.trainer.log_every_n_steps == 0:
-            self.log_dict({f"train/{name}": value for name, value in info.items()})
+            self.log_dict({f"train/{name}": value for name, value in self.terms.items()})
         if self.global_step % self.hparams.watch == 0:
-            self._watch(info)
+            self._watch(self.terms)
         return total
 
     def _watch(self, info: dict[str, Tensor]) -> None:
@@ -333,9 +333,7 @@ class PolicyModule(pl.LightningModule):
 
     def configure_optimizers(self) -> Any:
         """Adam over value, critic and policy together; a part that does not learn has no gradient and stays."""
-        return adam(
-            self.parameters(), self.hparams.lr, self.hparams.lr_schedule, self.hparams.warmup_steps, self
-        )
+        return adam(self.parameters(), self.hparams.lr, self.hparams.lr_schedule, self.hparams.warmup_steps, self)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

@@ -74,6 +74,8 @@ class SkillModule(pl.LightningModule):
         UserError: a setting outside its range; the message names it.
     """
 
+    hparams: Any  # Lightning gives its settings as attributes, but types them as a mapping
+
     def __init__(
         self,
         observation_dim: int,
@@ -135,6 +137,7 @@ class SkillModule(pl.LightningModule):
         )
         self.reconstruction_rmse = MeanMetric()
         self.usage = CodebookUsage(num_skills)
+        self.terms: dict[str, Tensor] = {}  # of the last training step, for whoever asks what went wrong
 
     def _check_settings(self) -> None:
         """Refuse settings with which nothing can be learnt."""
@@ -223,9 +226,7 @@ class SkillModule(pl.LightningModule):
     ) -> Tensor:
         """Draw actions (B, A), in the environment's units and inside its box, for skill vectors (B, D)."""
         scale = self.hparams.noise_scale if noise_scale is None else noise_scale
-        return self.action_box.from_unit(
-            self.decoder.sample(self.normaliser(observations), vectors, scale, generator)
-        )
+        return self.action_box.from_unit(self.decoder.sample(self.normaliser(observations), vectors, scale, generator))
 
     def _discrete(self, skill: Quantised | GaussianSkill) -> Quantised:
         if not isinstance(skill, Quantised):
@@ -261,18 +262,16 @@ class SkillModule(pl.LightningModule):
             observations = batch["observations"].to(self.device)
             actions = batch["actions"].to(self.device)
             outputs.append(
-                self.encoder(
-                    torch.cat([self.normaliser(observations), self.action_box.to_unit(actions)], dim=-1)
-                )
+                self.encoder(torch.cat([self.normaliser(observations), self.action_box.to_unit(actions)], dim=-1))
             )
         self.train(was_training)
         return torch.cat(outputs)
 
     def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """One optimiser step's loss."""
-        total, terms, _ = self.loss(batch)
+        total, self.terms, _ = self.loss(batch)
         if self.global_step % self.trainer.log_every_n_steps == 0:
-            log = {"loss": total.detach(), **terms}
+            log = {"loss": total.detach(), **self.terms}
             if isinstance(self.bottleneck, Codebook):
                 share = self.bottleneck.usage
                 log["perplexity"] = (-torch.special.xlogy(share, share).sum()).exp()
@@ -337,9 +336,7 @@ class SkillModule(pl.LightningModule):
 
     def configure_optimizers(self) -> Any:
         """Adam over encoder, codebook and decoder together."""
-        return adam(
-            self.parameters(), self.hparams.lr, self.hparams.lr_schedule, self.hparams.warmup_steps, self
-        )
+        return adam(self.parameters(), self.hparams.lr, self.hparams.lr_schedule, self.hparams.warmup_steps, self)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

@@ -307,7 +307,7 @@ def test_publishing_again_replaces_all(published):
 
 
 def test_what_was_not_published_is_never_replaced(tmp_path, published):
-    (published / "notes\.txt").write_text("mine")
+    (published / "notes.txt").write_text("mine")
     with pytest.raises(UserError, match=r"holds what was not published: notes\.txt"):
         publish(published, {"policy": small_policy()})
     home = tmp_path / "home"
@@ -318,7 +318,7 @@ def test_what_was_not_published_is_never_replaced(tmp_path, published):
     with pytest.raises(UserError, match="is a file"):
         publish(home / "config.yaml", {"policy": small_policy()})
     assert files_of(home) == {"config.yaml": b"mine"}
-    assert (published / "notes\.txt").read_text() == "mine"
+    assert (published / "notes.txt").read_text() == "mine"
 
 
 @pytest.mark.parametrize("failing", ["save_file", "write", "rename", "second rename"])

@@ -71,11 +71,16 @@ class ExactResume(Callback):
 
     With a loader that saves its own place (`TensorLoader`), a run that was stopped after any step and resumed
     in a new process ends with the same bits as one that never stopped, on a CPU.
+
+    The streams are also put back after each validation. When a checkpoint was written at a step that is
+    followed by a validation, Lightning leaves this validation out on resuming; so training must not depend
+    on what validation draws.
     """
 
     def __init__(self) -> None:
         """Nothing to restore yet."""
         self._states: list[dict[str, Any]] | None = None
+        self._before_validation: dict[str, Any] | None = None
 
     def on_save_checkpoint(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, checkpoint: dict[str, Any]
@@ -106,3 +111,13 @@ class ExactResume(Callback):
             )
             return
         set_rng_state(states[trainer.global_rank])
+
+    def on_validation_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Remember where training was."""
+        self._before_validation = rng_state()
+
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Let training go on from there."""
+        if self._before_validation is not None:
+            set_rng_state(self._before_validation)
+            self._before_validation = None

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
     from dds_lightning.reports import Report
 
+DPI = 150
 STAGES = ("data", "skill", "relabel", "policy", "clone", "evaluate")
 
 
@@ -177,7 +178,7 @@ def _draw(found: Findings, folder: Path) -> dict[str, Path]:
         made[name] = folder / f"{name}.png"
         with written_whole(made[name]) as part:
             # Without the version of matplotlib in it, the same picture is the same file.
-            figure.savefig(part, format="png", dpi=150, metadata={"Software": None})
+            figure.savefig(part, format="png", dpi=DPI, metadata={"Software": None})
 
     if found.task.maze_map is not None:
         _draw_maze(found, folder, keep, made)

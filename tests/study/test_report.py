@@ -1,7 +1,9 @@
 """A report is drawn from the run's files alone, and twice the same."""
 
 import dataclasses
+import functools
 import json
+import shutil
 
 import numpy as np
 import pandas as pd
@@ -10,6 +12,7 @@ import torch
 
 from dds_lightning.agent import DDSAgent
 from dds_lightning.errors import UserError
+from dds_lightning.interpret import clip
 from dds_lightning.policy import PolicyModule
 from dds_lightning.results import RolloutPath, RolloutResult
 from dds_lightning.skill import SkillModule
@@ -60,10 +63,18 @@ def result() -> RolloutResult:
     return RolloutResult(TASK.name, pd.DataFrame(rows), paths)
 
 
-@pytest.fixture
-def run(tmp_path):
+@pytest.fixture(scope="module", autouse=True)
+def _small_pictures():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report_module, "DPI", 40)
+        patch.setattr(clip, "write_clip", functools.partial(clip.write_clip, frames=6, fps=2))
+        yield
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
     """A run directory as `dds run` leaves it, made without training."""
-    root = tmp_path / "run"
+    root = tmp_path_factory.mktemp("report") / "run"
     result().save(root / "evaluate")
     torch.manual_seed(0)
     sizes = {"hidden_dim": 8, "encoder_layers": 1, "encoder_heads": 2, "decoder_blocks": 1, "skill_dim": 4}
@@ -84,21 +95,33 @@ def run(tmp_path):
     return root
 
 
+@pytest.fixture(scope="module")
+def made(run):
+    """What the first report of `run` returned."""
+    return write_report(run)
+
+
 def contents(folder):
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
-def test_the_report_twice_is_the_same_to_the_byte(run):
-    first = write_report(run)
+def test_the_report_twice_is_the_same_to_the_byte_and_names_every_path(run, made, capsys):
     before = contents(run / "report")
-    second = write_report(run)
-    assert first == second
+    again = report(run)
+    assert again.data == made
     assert contents(run / "report") == before
     assert not [name for name in before if name.startswith(".")]
+    again.print(as_json=False)
+    out = capsys.readouterr().out
+    assert "AWR policy, sampled" in out
+    assert "30.1 to 95.4" in out
+    assert f"({TASK.start_cell[0]}, {TASK.start_cell[1]})" in out
+    assert all(f"{name}: {path}" in out for name, path in made.items() if name.endswith(("report", "clip")))
+    again.print(as_json=True)
+    assert json.loads(capsys.readouterr().out)["main"] == "AWR policy, sampled"
 
 
-def test_every_file_of_a_maze_report_is_there_and_linked(run):
-    made = write_report(run)
+def test_every_file_of_a_maze_report_is_there_and_linked(run, made):
     text = made["report"].read_text()
     pictures = {"trajectories", "clip", "single_skills", "failed_ends", "skills_by_start", "values", "training"}
     assert pictures <= made.keys()
@@ -112,8 +135,7 @@ def test_every_file_of_a_maze_report_is_there_and_linked(run):
     assert str(run) not in text
 
 
-def test_facts_are_plain_json_and_say_where_the_main_contestant_failed(run):
-    made = write_report(run)
+def test_facts_are_plain_json_and_say_where_the_main_contestant_failed(made):
     facts = {name: made[name] for name in ("task", "main", "table", "failures")}
     assert json.loads(json.dumps(facts, allow_nan=False)) == facts
     row, column = TASK.start_cell
@@ -121,20 +143,7 @@ def test_facts_are_plain_json_and_say_where_the_main_contestant_failed(run):
     assert [entry["success"] for entry in facts["table"]] == [75.0, 0.0, 0.0, 0.0, 0.0, 0.0]
 
 
-def test_the_terminal_shows_the_table_and_every_path(run, capsys):
-    told_to_people = report(run)
-    told_to_people.print(as_json=False)
-    out = capsys.readouterr().out
-    assert "AWR policy, sampled" in out
-    assert "30.1 to 95.4" in out
-    assert f"({TASK.start_cell[0]}, {TASK.start_cell[1]})" in out
-    assert str(run / "report" / "report.md") in out
-    told_to_people.print(as_json=True)
-    assert json.loads(capsys.readouterr().out)["main"] == "AWR policy, sampled"
-
-
-def test_facts_read_back_from_a_marker_are_told_alike(run):
-    made = write_report(run)
+def test_facts_read_back_from_a_marker_are_told_alike(made):
     facts = {name: made[name] for name in ("task", "main", "table", "failures")}
     assert len(told(json.loads(json.dumps(facts)))) == 2
 
@@ -146,10 +155,11 @@ def test_what_a_killed_launch_logged_too_much_is_left_out(run, tmp_path):
     assert table["train/denoising"].tolist() == [0.0, 50.0, 70.0, 120.0]
 
 
-def test_a_task_without_a_maze_has_tables_and_no_maze_figures(run, monkeypatch):
+def test_a_task_without_a_maze_has_tables_and_no_maze_figures(run, tmp_path, monkeypatch):
+    shutil.copytree(run, tmp_path / "run", ignore=shutil.ignore_patterns("report"))
     plain_task = dataclasses.replace(TASK, maze_map=None, start_cell=None, goal_cell=None)
     monkeypatch.setattr(report_module, "get_task", lambda name: plain_task)
-    made = write_report(run)
+    made = write_report(tmp_path / "run")
     assert made.keys() & {"trajectories", "clip", "values", "failed_ends"} == set()
     assert made["failures"][0]["row"] is None
     assert "training" in made
