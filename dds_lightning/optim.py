@@ -1,4 +1,4 @@
-"""The one optimiser both stages use: Adam with an optional warm-up and cosine decay."""
+"""What both stages share in training: Adam with an optional warm-up and cosine decay, and when to log."""
 
 import math
 from collections.abc import Iterable
@@ -42,3 +42,9 @@ def adam(
 
     scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
     return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+
+def is_log_step(module: pl.LightningModule) -> bool:
+    """Whether this step is logged: `log_dict` at every step of a small network costs as much as the step."""
+    every = getattr(module.trainer, "log_every_n_steps", 50)
+    return module.global_step % max(every, 1) == 0

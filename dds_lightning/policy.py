@@ -24,7 +24,7 @@ from dds_lightning import losses
 from dds_lightning.errors import UserError
 from dds_lightning.nn.mlp import MLP, FourierFeatures
 from dds_lightning.nn.normaliser import Normaliser
-from dds_lightning.optim import adam
+from dds_lightning.optim import adam, is_log_step
 
 Selection = Literal["sample", "greedy", "argmax_q"]
 
@@ -281,7 +281,7 @@ class PolicyModule(pl.LightningModule):
     def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """One optimiser step's loss."""
         total, self.terms = self.loss(batch)
-        if self.global_step % self.trainer.log_every_n_steps == 0:
+        if is_log_step(self):
             self.log_dict({f"train/{name}": value for name, value in self.terms.items()})
         if self.global_step % self.hparams.watch == 0:
             self._watch(self.terms)
@@ -309,7 +309,8 @@ class PolicyModule(pl.LightningModule):
     @torch.no_grad()
     def on_train_batch_end(self, outputs: Any, batch: dict[str, Tensor], batch_idx: int) -> None:
         """Move the target critic towards the critic."""
-        target, online = list(self.target_critic.parameters()), list(self.critic.parameters())
+        target: list[Tensor] = list(self.target_critic.parameters())
+        online: list[Tensor] = list(self.critic.parameters())
         torch._foreach_lerp_(target, online, self.hparams.target_ema)
 
     def validation_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:

@@ -23,7 +23,7 @@ from dds_lightning.nn.diffusion import DiffusionDecoder, MLPDecoder, Sampler
 from dds_lightning.nn.encoder import ENCODERS
 from dds_lightning.nn.gaussian import GaussianBottleneck, GaussianSkill
 from dds_lightning.nn.normaliser import ActionBox, Normaliser
-from dds_lightning.optim import adam
+from dds_lightning.optim import adam, is_log_step
 
 START_BATCHES = 64
 """Batches whose encodings start the codebook by k-means."""
@@ -249,7 +249,7 @@ class SkillModule(pl.LightningModule):
             self.action_box.fit(statistics["action_low"], statistics["action_high"])
         if isinstance(self.bottleneck, Codebook) and not bool(self.bottleneck.initted):
             # A loader of its own: looking at the data must not move the training's place in it.
-            loader = datamodule.train_dataloader() if datamodule else self.trainer.train_dataloader
+            loader: Any = datamodule.train_dataloader() if datamodule else self.trainer.train_dataloader
             self.bottleneck.start_from(self._encodings(islice(iter(loader), START_BATCHES)))
 
     @torch.no_grad()
@@ -270,7 +270,7 @@ class SkillModule(pl.LightningModule):
     def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """One optimiser step's loss."""
         total, self.terms, _ = self.loss(batch)
-        if self.global_step % self.trainer.log_every_n_steps == 0:
+        if is_log_step(self):
             log = {"loss": total.detach(), **self.terms}
             if isinstance(self.bottleneck, Codebook):
                 share = self.bottleneck.usage
@@ -288,7 +288,8 @@ class SkillModule(pl.LightningModule):
             return
         generator = torch.Generator().manual_seed(step)
         moved = self.bottleneck.restart_dead(self._encodings([batch]), h.restart_threshold, generator)
-        state = self.optimizers().state.get(self.bottleneck.vectors, {})
+        optimizer: Any = self.optimizers()
+        state = optimizer.state.get(self.bottleneck.vectors, {})
         for name in ("exp_avg", "exp_avg_sq"):  # the moments belonged to the code that died
             if name in state:
                 state[name][moved] = 0.0

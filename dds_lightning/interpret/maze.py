@@ -303,8 +303,8 @@ def plot_value_map(
                 )
                 ax.annotate(
                     "",
-                    centre + step,
-                    centre,
+                    tuple(centre + step),
+                    tuple(centre),
                     arrowprops={"arrowstyle": "->", "color": "white", "lw": 1.2},
                     zorder=3,
                 )

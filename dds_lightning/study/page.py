@@ -26,7 +26,7 @@ def page(found: Findings, files: Mapping[str, str]) -> str:
         parts.append("## How the policy gets there\n")
         parts.append(_picture(files, "trajectories", f"{found.main}, coloured by the skill in use."))
     if "clip" in files:
-        parts.append(_picture(files, "clip", "One episode, the one of median length among the best."))
+        parts.append(_picture(files, "clip", "One episode: the successful one of median length, if any succeeded."))
     parts.append(_skills(found, files))
     parts.append(_failures(found, files))
     if "values" in files:

@@ -56,15 +56,12 @@ def summary_table(episodes: pd.DataFrame) -> pd.DataFrame:
         if len(labels) == 1:
             rows.append(_row(str(actor), CONTESTANT, played))
             continue
-        parts = [
-            _row(f"{actor}: {label.removeprefix('skill ')}", SKILL, played[played["label"] == label])
-            for label in labels
-        ]
+        parts = [_row(f"{label} alone", SKILL, played[played["label"] == label]) for label in labels]
         rows.append(_row(f"{actor}, all {len(labels)} together", CONTESTANT, played))
         best = max(parts, key=_rank)
         alike = all(_rank(part) == _rank(best) for part in parts)
-        name = "all alike" if alike else best["contestant"].removeprefix(f"{actor}: ")
-        rows.append({**best, "contestant": f"best {actor}: {name}", "kind": BEST})
+        name = "all alike" if alike else best["contestant"].removesuffix(" alone")
+        rows.append({**best, "contestant": f"best {actor} ({name})", "kind": BEST})
         rows += parts
     return pd.DataFrame(rows)
 

@@ -82,9 +82,9 @@ def test_summary_has_contestants_in_order_with_the_best_part_and_every_part():
     assert table["contestant"].tolist() == [
         "policy",
         "single skill, all 2 together",
-        "best single skill: 1",
-        "single skill: 0",
-        "single skill: 1",
+        "best single skill (skill 1)",
+        "skill 0 alone",
+        "skill 1 alone",
         "clone",
     ]
     assert table["kind"].tolist() == ["contestant", "contestant", "best", "skill", "skill", "contestant"]
@@ -103,7 +103,7 @@ def test_summary_numbers_of_one_contestant():
 def test_no_best_part_where_all_are_alike():
     table = episodes()
     table.loc[table["actor"] == "single skill", ["success", "score", "length"]] = [False, 0.0, 800]
-    assert summary_table(table)["contestant"][2] == "best single skill: all alike"
+    assert summary_table(table)["contestant"][2] == "best single skill (all alike)"
 
 
 def test_failures_are_counted_by_cell_and_skill():
