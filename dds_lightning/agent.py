@@ -87,9 +87,7 @@ class DDSAgent(nn.Module):
         if self.selection not in choices:
             raise UserError(f"selection is '{self.selection}', expected one of {', '.join(choices)}")
         if self.temperature <= 0:
-            raise UserError(
-                f"temperature is {self.temperature}, expected more than 0 ('greedy' is the limit)"
-            )
+            raise UserError(f"temperature is {self.temperature}, expected more than 0 ('greedy' is the limit)")
         if self.noise_scale is not None and self.noise_scale < 0:
             raise UserError(f"noise_scale is {self.noise_scale}, expected 0 or more")
         if self.policy is None and self.selection not in ("random", "fixed"):
@@ -186,9 +184,7 @@ class DDSAgent(nn.Module):
                 "was trained on another environment, or the observations are not flat"
             )
         if len(batch) != len(rows):
-            raise UserError(
-                f"{len(batch)} observations for {len(rows)} environments: reset({len(batch)}) first"
-            )
+            raise UserError(f"{len(batch)} observations for {len(rows)} environments: reset({len(batch)}) first")
         if restarted is not None and np.shape(restarted) != rows.shape:
             raise UserError(f"restarted is {np.shape(restarted)}, expected ({len(rows)},)")
         x = torch.from_numpy(np.ascontiguousarray(batch)).to(self.device)
@@ -205,9 +201,7 @@ class DDSAgent(nn.Module):
         self._decided[:] = False
         if due.any():
             late = rows[due]
-            chosen = (
-                observations if due.all() else observations[torch.from_numpy(due).to(observations.device)]
-            )
+            chosen = observations if due.all() else observations[torch.from_numpy(due).to(observations.device)]
             self._codes[late], self._clock[late], self._decided[late] = (
                 self._pick(chosen, late),
                 self.horizon,
@@ -236,9 +230,7 @@ class DDSAgent(nn.Module):
         """Actions (n, A) of codes (n,) in observations (n, O)."""
         self.skill.eval() if self.skill.training else None
         index = torch.from_numpy(codes).to(observations.device)
-        actions = self.skill.decode(
-            observations, index, noise_scale=self.noise_scale, generator=self.generator()
-        )
+        actions = self.skill.decode(observations, index, noise_scale=self.noise_scale, generator=self.generator())
         return actions.float().cpu().numpy()
 
     def generator(self) -> torch.Generator:
@@ -316,6 +308,4 @@ class DDSAgent(nn.Module):
         try:
             return cls(skill, policy, **acting)
         except TypeError as error:
-            raise UserError(
-                f"{directory}: an agent setting that this version does not know: {error}"
-            ) from None
+            raise UserError(f"{directory}: an agent setting that this version does not know: {error}") from None

@@ -20,13 +20,14 @@ import pickle
 import subprocess
 import sys
 import weakref
+from collections import deque
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dds_lightning.envworker import Slots, read_frame, record_dtype, write_frame
+from dds_lightning.envworker import Slots, pack_step, read_frame, record_dtype, write_frame
 from dds_lightning.errors import UserError
 
 if TYPE_CHECKING:
@@ -44,17 +45,16 @@ class _Local:
 
     def __init__(self, task: Task, count: int) -> None:
         self.slots = Slots(task, count)
-        self.answer: NDArray[Any] | None = None
+        self.answers: deque[NDArray[Any]] = deque()
 
     def send_start(self, seeds: list[list[int]]) -> None:
-        self.answer = self.slots.start(seeds)
+        self.answers.append(self.slots.start(seeds))
 
-    def send_step(self, actions: NDArray[np.float32]) -> None:
-        self.answer = self.slots.step(actions)
+    def send_step(self, slots: NDArray[np.int64], actions: NDArray[np.float32]) -> None:
+        self.answers.append(self.slots.step(slots, actions))
 
     def receive(self) -> NDArray[Any]:
-        assert self.answer is not None
-        return self.answer
+        return self.answers.popleft()
 
     def close(self) -> None:
         self.slots.close()
@@ -81,8 +81,8 @@ class _Remote:
     def send_start(self, seeds: list[list[int]]) -> None:
         self._send(b"R", pickle.dumps(seeds))
 
-    def send_step(self, actions: NDArray[np.float32]) -> None:
-        self._send(b"S", actions.tobytes())
+    def send_step(self, slots: NDArray[np.int64], actions: NDArray[np.float32]) -> None:
+        self._send(b"S", pack_step(slots, actions))
 
     def receive(self) -> NDArray[Any]:
         kind, payload = self._read()
@@ -117,8 +117,11 @@ class _Remote:
 class EnvPool:
     """Environments of one task, split over worker processes; use it as a context manager or call `close`.
 
-    Workers take about 0.7 s to start, so keep the pool where rollouts repeat. Results do not depend on the
+    Workers take about a second to start, so keep the pool where rollouts repeat. Results do not depend on the
     number of workers.
+
+    `step` waits for the environments. To act on some slots while others are stepped, `send` several requests
+    for different slots and `receive` their answers in the same order.
 
     Args:
         task: what to build; must be picklable when there are workers.
@@ -134,24 +137,28 @@ class EnvPool:
         """Start the workers and build the environments."""
         if num_envs < 1:
             raise UserError(f"slots is {num_envs}, expected at least 1 environment")
-        workers = available_cores() if workers is None else workers
+        # A worker for fewer than four environments would mostly wait for its messages.
+        workers = min(available_cores(), -(-num_envs // 4)) if workers is None else workers
         if workers < 0:
             raise UserError(f"workers is {workers}, expected 0 (no processes) or more")
-        workers = min(workers, num_envs)
+        workers = min(workers, -(-num_envs // 2))
         self.task, self.num_envs, self.workers = task, num_envs, workers
-        self.seeds: list[list[int]] = []
+        # Neighbouring slots play alike contestants, so deal them out: in pairs, as rollouts send every second.
+        slots, parts = np.arange(num_envs), max(workers, 1)
+        self._owner = slots // 2 % parts
+        self._place = slots // (2 * parts) * 2 + slots % 2  # within the owner
         self._parts: list[_Local | _Remote] = []
-        # Neighbouring slots play alike contestants, so deal them out: part w has slots w, w + W, ...
-        self._slots = [np.arange(part, num_envs, max(workers, 1)) for part in range(max(workers, 1))]
+        self._sent: deque[NDArray[np.intp]] = deque()
         self._alive = np.zeros(num_envs, dtype=bool)
         self._broken = True
         try:
-            for number, slots in enumerate(self._slots):
-                name = f"environment worker {number} of {workers} ({task.name})"
-                self._parts.append(_Remote(task, len(slots), name) if workers else _Local(task, len(slots)))
-            for part in self._parts:
-                if isinstance(part, _Remote):
-                    part.receive()
+            for part in range(parts):
+                name = f"environment worker {part} of {workers} ({task.name})"
+                count = int(np.sum(self._owner == part))
+                self._parts.append(_Remote(task, count, name) if workers else _Local(task, count))
+            for own in self._parts:
+                if isinstance(own, _Remote):
+                    own.receive()
         except BaseException:
             self.close()
             raise
@@ -173,40 +180,54 @@ class EnvPool:
         """
         if len(seeds) > self.num_envs:
             raise UserError(f"{len(seeds)} slots wanted, but the pool has {self.num_envs} environments")
+        while self._sent:
+            self.receive()
         plan = [list(map(int, own)) for own in seeds] + [[] for _ in range(self.num_envs - len(seeds))]
+        slots = [np.flatnonzero(self._owner == part) for part in range(len(self._parts))]
         records = np.zeros(self.num_envs, record_dtype(self.task))
         with self._exchange():
-            for part, slots in zip(self._parts, self._slots, strict=True):
-                part.send_start([plan[slot] for slot in slots])
-            for part, slots in zip(self._parts, self._slots, strict=True):
-                records[slots] = part.receive()
+            for part, own in zip(self._parts, slots, strict=True):
+                part.send_start([plan[slot] for slot in own])
+            for part, own in zip(self._parts, slots, strict=True):
+                records[own] = part.receive()
         self._alive = records["alive"].copy()
         return records
 
-    def step(self, actions: NDArray[np.float32]) -> NDArray[Any]:
-        """Step every live slot once.
+    def send(self, slots: NDArray[np.intp], actions: NDArray[np.float32]) -> None:
+        """Ask for one step of some live slots that no other request in progress holds.
 
         Args:
-            actions: (n, A), a row for each slot of `alive`, in that order.
-
-        Returns:
-            (n,) records of the same slots, see `record_dtype`.
+            slots: (n,) ascending.
+            actions: (n, A), a row each.
         """
-        slots = self.alive
         actions = np.ascontiguousarray(actions, dtype=np.float32)
         if actions.shape != (len(slots), self.task.action_dim):
             raise ValueError(f"actions are {actions.shape}, expected {(len(slots), self.task.action_dim)}")
-        owner = slots % len(self._parts)
-        records = np.zeros(len(slots), record_dtype(self.task))
-        rows = [np.flatnonzero(owner == part) for part in range(len(self._parts))]
-        busy = [(part, own) for part, own in zip(self._parts, rows, strict=True) if len(own)]
+        owner = self._owner[slots]
         with self._exchange():
-            for part, own in busy:
-                part.send_step(actions[own])
-            for part, own in busy:
-                records[own] = part.receive()
+            for number, part in enumerate(self._parts):
+                rows = owner == number
+                if rows.any():
+                    part.send_step(self._place[slots[rows]], actions[rows])
+        self._sent.append(slots)
+
+    def receive(self) -> tuple[NDArray[np.intp], NDArray[Any]]:
+        """Wait for the oldest request: its slots (n,) and their records (n,), see `record_dtype`."""
+        slots = self._sent.popleft()
+        records = np.zeros(len(slots), record_dtype(self.task))
+        owner = self._owner[slots]
+        with self._exchange():
+            for number, part in enumerate(self._parts):
+                rows = owner == number
+                if rows.any():
+                    records[rows] = part.receive()
         self._alive[slots] = records["alive"]
-        return records
+        return slots, records
+
+    def step(self, actions: NDArray[np.float32]) -> NDArray[Any]:
+        """Step every live slot once: actions (n, A) in the order of `alive`, to records (n,)."""
+        self.send(self.alive, actions)
+        return self.receive()[1]
 
     @contextlib.contextmanager
     def _exchange(self) -> Any:
@@ -220,6 +241,11 @@ class EnvPool:
             raise
 
     @property
+    def busy(self) -> bool:
+        """Whether there is a request to `receive`."""
+        return bool(self._sent)
+
+    @property
     def closed(self) -> bool:
         """Whether the pool can no longer be used."""
         return self._broken
@@ -228,6 +254,7 @@ class EnvPool:
         """End the workers and close the environments; harmless when repeated."""
         self._broken = True
         self._alive[:] = False
+        self._sent.clear()
         parts, self._parts = self._parts, []
         for part in parts:
             if isinstance(part, _Remote) and part.process.stdin is not None:

@@ -56,7 +56,6 @@ class Slots:
             self.envs = [task.make_env() for _ in range(count)]
         self.dtype = record_dtype(task)
         self.seeds: list[list[int]] = [[] for _ in self.envs]
-        self.live: list[int] = []
 
     def start(self, seeds: list[list[int]]) -> NDArray[Any]:
         """Give every slot its list of seeds and begin the first episodes; a record a slot."""
@@ -64,14 +63,12 @@ class Slots:
         records = np.zeros(len(self.envs), self.dtype)
         for slot, record in enumerate(records):
             self._begin(slot, record)
-        self.live = [slot for slot in range(len(records)) if records[slot]["alive"]]
         return records
 
-    def step(self, actions: NDArray[np.float32]) -> NDArray[Any]:
-        """Step the live slots, in order; a record a live slot."""
-        records = np.zeros(len(self.live), self.dtype)
-        for row, (slot, action) in enumerate(zip(self.live, actions, strict=True)):
-            record = records[row]
+    def step(self, slots: NDArray[np.int64], actions: NDArray[np.float32]) -> NDArray[Any]:
+        """Step some slots; a record each."""
+        records = np.zeros(len(slots), self.dtype)
+        for slot, action, record in zip(slots.tolist(), actions, records, strict=True):
             observation, reward, terminated, truncated, info = self.envs[slot].step(action)
             position = info.get("position", np.nan)
             record["reached"], record["reached_position"] = observation, position
@@ -81,7 +78,6 @@ class Slots:
                 self._begin(slot, record)
             else:
                 record["observation"], record["position"], record["alive"] = observation, position, True
-        self.live = [slot for slot, record in zip(self.live, records, strict=True) if record["alive"]]
         return records
 
     def _begin(self, slot: int, record: Any) -> None:
@@ -142,6 +138,18 @@ def read_frame(stream: IO[bytes]) -> tuple[bytes, bytes] | None:
     return (kind, payload) if len(payload) == size else None
 
 
+def pack_step(slots: NDArray[np.int64], actions: NDArray[np.float32]) -> bytes:
+    """A request to step `slots` (n,) with `actions` (n, A)."""
+    return slots.astype(np.int64).tobytes() + actions.tobytes()
+
+
+def unpack_step(payload: bytes, action_dim: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """The inverse of `pack_step`."""
+    count = len(payload) // (8 + 4 * action_dim)
+    actions = np.frombuffer(payload, np.float32, offset=8 * count).reshape(count, action_dim)
+    return np.frombuffer(payload, np.int64, count), actions
+
+
 def worker_main() -> None:
     """What a worker process runs until its input ends."""
     # Ctrl-C reaches the whole terminal: the caller decides, and its end is ours.
@@ -162,8 +170,7 @@ def worker_main() -> None:
                 if kind == b"R":
                     answer = slots.start(pickle.loads(payload)).tobytes()
                 else:
-                    width = max(len(slots.live), 1)
-                    answer = slots.step(np.frombuffer(payload, np.float32).reshape(width, -1)).tobytes()
+                    answer = slots.step(*unpack_step(payload, task.action_dim)).tobytes()
             reply = b"O"
         except Exception:
             reply, answer = b"E", traceback.format_exc().encode()

@@ -8,6 +8,7 @@
 
 import logging
 import shlex
+import signal
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,8 +16,9 @@ from typing import Any
 
 import lightning.pytorch as pl
 import torch
-from jsonargparse import Namespace
+from jsonargparse import ArgumentError, Namespace
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from dds_lightning import interrupts
 from dds_lightning.checkpointing import load_ckpt
@@ -175,8 +177,11 @@ class StageCLI(LightningCLI):
 
     def _fit(self, **kwargs: Any) -> Report:
         kwargs["weights_only"] = True
-        with interrupts.deferred():
-            self.trainer.fit(**kwargs)
+        try:
+            with interrupts.deferred():
+                self.trainer.fit(**kwargs)
+        except SIGTERMException:  # before the first step; Lightning would end with status 0
+            raise interrupts.Interrupted(signal.SIGTERM) from None
         saved = {
             "checkpoint": next(
                 (c.path for c in self.trainer.checkpoint_callbacks if isinstance(c, RollingCheckpoint)), None
@@ -193,7 +198,7 @@ class StageCLI(LightningCLI):
             "metrics": _numbers(self.trainer.callback_metrics),
             "logs": self.trainer.log_dir,
         }
-        lines = [f"{self.trainer.global_step:,} steps; logs in {self.trainer.log_dir}"]
+        lines: list[Any] = [f"{self.trainer.global_step:,} steps; logs in {self.trainer.log_dir}"]
         lines += [f"{name}: {path}" for name, path in saved.items() if path]
         return Report(data, lines)
 
@@ -215,7 +220,7 @@ class StageCLI(LightningCLI):
         import pandas as pd
 
         kwargs |= {"return_predictions": True, "weights_only": True}
-        batches = self.trainer.predict(**kwargs) or []
+        batches: list[Any] = self.trainer.predict(**kwargs) or []
         codes = torch.cat([batch.reshape(-1) for batch in batches]).cpu().numpy()
         folder = Path(self.trainer.log_dir or self.trainer.default_root_dir)
         folder.mkdir(parents=True, exist_ok=True)
@@ -272,10 +277,17 @@ def command(stage: str, words: Sequence[str]) -> Callable[[], Report]:
 
 
 def settings_of(stage: str, words: Sequence[str]) -> dict[str, Any]:
-    """All settings of a `fit`, defaults included, as plain values: what `--print_config` prints."""
+    """All settings of a `fit`, defaults included, as plain values: what `--print_config` prints.
+
+    Raises:
+        UserError: words that `dds STAGE fit` does not understand.
+    """
     import yaml
 
-    cli = StageCLI(stage, words, parse_only=True)
+    try:
+        cli = StageCLI(stage, words, parse_only=True)
+    except ArgumentError as error:
+        raise UserError(f"dds {stage} fit: {error.message}") from None
     parser = cli._parser(cli.config.subcommand)
     text = parser.dump(cli.config[cli.config.subcommand], skip_unset=False, skip_validation=True)
     return yaml.safe_load(text)

@@ -29,6 +29,7 @@ class Interrupted(SystemExit):
 
 
 class _Mark:
+    catching = False
     deferring = False
     signum: int | None = None
 
@@ -53,11 +54,20 @@ def caught() -> Iterator[None]:
         yield
         return
     before = {signum: signal.signal(signum, _on_signal) for signum in SIGNALS}
+    _Mark.catching = True
     try:
         yield
     finally:
+        _Mark.catching = False
         for signum, handler in before.items():
             signal.signal(signum, handler)
+
+
+def take_back() -> None:
+    """Inside `caught()`, handle the signals again after somebody else (a Trainer) has put handlers of its own."""
+    if _Mark.catching and threading.current_thread() is threading.main_thread():
+        for signum in SIGNALS:
+            signal.signal(signum, _on_signal)
 
 
 @contextmanager

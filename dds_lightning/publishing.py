@@ -67,14 +67,8 @@ class Published:
             UserError: it is not there, or its weights do not fit its settings.
         """
         if not isinstance(self.config.get(part), dict):
-            raise UserError(
-                f"{self.directory / CONFIG} describes no '{part}'; it has {', '.join(self.config)}"
-            )
-        state = {
-            key.removeprefix(f"{part}."): value
-            for key, value in self.state.items()
-            if key.startswith(f"{part}.")
-        }
+            raise UserError(f"{self.directory / CONFIG} describes no '{part}'; it has {', '.join(self.config)}")
+        state = {key.removeprefix(f"{part}."): value for key, value in self.state.items() if key.startswith(f"{part}.")}
         return build_module(cls, self.config[part], state, f"{self.directory} ({part})")
 
 
@@ -176,9 +170,7 @@ def _verify_sums(directory: Path) -> None:
     for line in (directory / SUMS).read_text(encoding="utf-8", errors="replace").splitlines():
         digest, _, name = line.partition("  ")
         if name not in CONTENTS or len(digest) != 64:
-            raise UserError(
-                f"{directory / SUMS}: '{line[:80]}' is no line of it, expected a hash and a file name"
-            )
+            raise UserError(f"{directory / SUMS}: '{line[:80]}' is no line of it, expected a hash and a file name")
         sums[name] = digest
     for name in CONTENTS:
         if sums.get(name) != sha256(directory / name):
@@ -208,9 +200,7 @@ def _refuse_foreign(target: Path) -> None:
     foreign = sorted(there - {*CONTENTS, SUMS}) if SUMS in there else sorted(there)
     if foreign:
         names = ", ".join(foreign[:5]) + (" ..." if foreign[5:] else "")
-        raise UserError(
-            f"{target} holds what was not published: {names}; move it away or choose another directory"
-        )
+        raise UserError(f"{target} holds what was not published: {names}; move it away or choose another directory")
 
 
 def _backup(target: Path) -> Path:
@@ -253,15 +243,11 @@ def _plain(value: Any, where: str) -> Any:
         return _plain(value.tolist(), where)
     if isinstance(value, os.PathLike):
         return os.fspath(value)
-    raise UserError(
-        f"{where} is a {type(value).__name__}, expected a number, a text, a list or names with values"
-    )
+    raise UserError(f"{where} is a {type(value).__name__}, expected a number, a text, a list or names with values")
 
 
 def _short_card(name: str, config: Mapping[str, Any]) -> str:
-    about = "\n".join(
-        f"- {key}: {value}" for key, value in config.items() if not isinstance(value, (dict, list))
-    )
+    about = "\n".join(f"- {key}: {value}" for key, value in config.items() if not isinstance(value, (dict, list)))
     return (
         f"# {name}\n\nDiscrete diffusion skills, written by dds-lightning.\n\n{about}\n\n"
         f'```python\nfrom dds_lightning import DDSAgent\n\nagent = DDSAgent.load("{name}")\n```\n'
@@ -283,17 +269,13 @@ def build_module(cls: type[M], settings: Mapping[str, Any], state: Mapping[str, 
     missing, unknown = sorted(own.keys() - state.keys()), sorted(state.keys() - own.keys())
     if missing or unknown:
         lists = ((what, names) for what, names in (("lacks", missing), ("has unknown", unknown)) if names)
-        text = " and ".join(
-            f"{what} {', '.join(names[:3])}{' ...' if names[3:] else ''}" for what, names in lists
-        )
+        text = " and ".join(f"{what} {', '.join(names[:3])}{' ...' if names[3:] else ''}" for what, names in lists)
         raise UserError(f"{origin} does not fit {cls.__name__}: it {text}")
     for name, value in state.items():
         if value.shape != own[name].shape:
             shapes = f"{tuple(value.shape)}, expected {tuple(own[name].shape)}"
             raise UserError(f"{origin} does not fit {cls.__name__}: {name} is {shapes}")
         if value.is_floating_point() and bool(torch.isnan(value).any()):
-            raise UserError(
-                f"{origin} holds NaN in {name}: its training diverged; take an earlier checkpoint"
-            )
+            raise UserError(f"{origin} holds NaN in {name}: its training diverged; take an earlier checkpoint")
     module.load_state_dict(state)
     return module.eval()

@@ -68,9 +68,7 @@ class RolloutResult:
                     "episodes": len(part),
                     "success": 100.0 * part["success"].mean(),
                     "score": part["score"].mean(),
-                    "score_error": part["score"].std(ddof=1) / np.sqrt(len(part))
-                    if len(part) > 1
-                    else np.nan,
+                    "score_error": part["score"].std(ddof=1) / np.sqrt(len(part)) if len(part) > 1 else np.nan,
                     "return": part["return"].mean(),
                     "length": part["length"].mean(),
                     "length_success": part.loc[part["success"], "length"].mean(),
@@ -120,9 +118,7 @@ class RolloutResult:
                 arrays = {name: stored[name] for name in stored.files}
             lengths = table["length"].to_numpy()
             if len(arrays["codes"]) != lengths.sum() or len(arrays["positions"]) != (lengths + 1).sum():
-                raise UserError(
-                    f"{directory / _PATHS} is of another rollout than {file}: run the rollout again"
-                )
+                raise UserError(f"{directory / _PATHS} is of another rollout than {file}: run the rollout again")
             step = state = 0
             for actor, episode, length in zip(table["actor"], table["episode"], lengths, strict=True):
                 states = slice(state, state + length + 1)

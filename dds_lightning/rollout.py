@@ -4,8 +4,8 @@ Contestants play side by side in one `EnvPool`. Each has slots of its own and a 
 over them, so an episode that fails slowly counts as much as one that succeeds fast. Episode i of every
 contestant starts from the same environment seed: comparisons are paired.
 
-The same call gives the same table: results depend on task, contestants, `seed` and `slots`, not on `workers`.
-(They depend on `slots` because the rows of one batch share the actor's random stream.)
+The same call gives the same table: it depends on task, contestants, `seed` and `slots` (the rows of a batch
+share the actor's random stream), not on `workers`.
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ import contextlib
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -23,17 +22,18 @@ from numpy.typing import NDArray
 
 from dds_lightning.actors import Actor, Contestant
 from dds_lightning.actors import single_skills as single_skills
-from dds_lightning.envpool import EnvPool
+from dds_lightning.envpool import EnvPool, available_cores
 from dds_lightning.errors import UserError
 from dds_lightning.results import RolloutPath as RolloutPath
 from dds_lightning.results import RolloutResult as RolloutResult
 from dds_lightning.tasks import Task, get_task
 
-DEFAULT_SLOTS = 128
+DEFAULT_SLOTS = 192
+OVERLAP = range(24, 4096)
+"""Slots with which acting and stepping overlap: half a batch must be worth acting for."""
 
 
-@dataclass(frozen=True)
-class _Plan:
+class _Plan(NamedTuple):
     """One contestant's slots: for each, which of its episodes it plays."""
 
     contestant: Contestant
@@ -59,7 +59,7 @@ def rollout(
         contestants: who plays.
         seed: of environments and actors.
         workers: processes that step environments; None one a core, 0 none but this.
-        slots: environments in all; at least one is used for each contestant and label.
+        slots: environments in all; more are used when there are more contestants and labels.
         progress: show a bar when standard error is a terminal.
         record: keep the path of every episode.
         record_observations: keep the observations as well.
@@ -75,19 +75,20 @@ def rollout(
     """
     task = get_task(task) if isinstance(task, str) else task
     _check(contestants)
+    if slots < 1:
+        raise UserError(f"slots is {slots}, expected at least 1")
     if pool is not None and pool.task != task:
         raise UserError(f"the pool has environments of '{pool.task.name}', expected '{task.name}'")
     bundles = _bundles(contestants)
-    limit = slots if pool is None else min(slots, pool.num_envs)
-    plans = [_plan(contestant, limit, contestants) for _, members in bundles for contestant in members]
+    members = [contestant for _, own in bundles for contestant in own]
+    plans = _plans(members, slots, pool.num_envs if pool else None)
     total = sum(len(plan.slots) for plan in plans)
-    if pool is not None and total > pool.num_envs:
-        raise UserError(f"the pool has {pool.num_envs} environments, but these contestants need {total}")
     with contextlib.ExitStack() as stack:
         if pool is None:
             pool = stack.enter_context(EnvPool(task, total, workers))
         report = stack.enter_context(_progress_bar(sum(plan.contestant.episodes for plan in plans), progress))
         match = _Match(pool, plans, seed, record or record_observations, record_observations, report)
+        stack.enter_context(_few_threads(pool.workers))
         rows = match.play(_seated(bundles, plans, seed))
     order = {contestant.name: i for i, contestant in enumerate(contestants)}
     rows.sort(key=lambda row: (order[row["actor"]], row["episode"]))
@@ -113,9 +114,7 @@ def _check(contestants: Sequence[Contestant]) -> None:
         raise UserError("two contestants share one actor object; give each its own (an agent's `variant()`)")
     for contestant in contestants:
         if contestant.episodes < 1:
-            raise UserError(
-                f"contestant '{contestant.name}': episodes is {contestant.episodes}, expected 1 or more"
-            )
+            raise UserError(f"contestant '{contestant.name}': episodes is {contestant.episodes}, expected 1 or more")
         if contestant.labels is not None and len(contestant.labels) != contestant.episodes:
             raise UserError(
                 f"contestant '{contestant.name}': {len(contestant.labels)} labels for {contestant.episodes} "
@@ -128,15 +127,28 @@ def _bundles(contestants: Sequence[Contestant]) -> list[tuple[Any, list[Contesta
     bundles: dict[Any, list[Contestant]] = {}
     for contestant in contestants:
         key = getattr(contestant.actor, "group_key", None)
-        bundles.setdefault(contestant.name if key is None else (type(contestant.actor), key), []).append(
-            contestant
-        )
+        bundles.setdefault(contestant.name if key is None else (type(contestant.actor), key), []).append(contestant)
     return list(bundles.items())
 
 
-def _plan(contestant: Contestant, limit: int, contestants: Sequence[Contestant]) -> _Plan:
+def slots_needed(contestants: Sequence[Contestant], slots: int = DEFAULT_SLOTS) -> int:
+    """Environments that a rollout of these contestants with `slots` uses."""
+    return sum(len(plan.slots) for plan in _plans(contestants, slots))
+
+
+def _plans(contestants: Sequence[Contestant], slots: int, most: int | None = None) -> list[_Plan]:
+    """Everybody's plan, with fewer slots each if there are no more than `most`."""
+    episodes = sum(contestant.episodes for contestant in contestants)
+    for limit in range(slots, 0, -1):
+        plans = [_plan(contestant, limit * contestant.episodes / episodes) for contestant in contestants]
+        total = sum(len(plan.slots) for plan in plans)
+        if most is None or total <= most:
+            return plans
+    raise UserError(f"the pool has {most} environments, but these contestants need at least {total}")
+
+
+def _plan(contestant: Contestant, share: float) -> _Plan:
     """Split a contestant's episodes over its share of the slots, evenly, each slot with one label only."""
-    share = limit * contestant.episodes / sum(other.episodes for other in contestants)
     labels = contestant.labels or [""] * contestant.episodes
     members: dict[str, list[int]] = {}
     for episode, label in enumerate(labels):
@@ -148,8 +160,7 @@ def _plan(contestant: Contestant, limit: int, contestants: Sequence[Contestant])
     return _Plan(contestant, slots)
 
 
-@dataclass(frozen=True)
-class _Seat:
+class _Seat(NamedTuple):
     """An actor and the range of slots it plays."""
 
     name: str
@@ -213,45 +224,55 @@ class _Match:
 
     def play(self, seats: list[_Seat]) -> list[dict[str, Any]]:
         """Play to the end; a row an episode, in the order in which they end."""
-        pool, rows = self.pool, []
-        seeds = [[own[i] for i in todo] for own, todo in zip(self.seeds, self.todo, strict=True)]
-        start = pool.start(seeds)
-        observations = start["observation"].copy()  # (slots, O)
-        restarted = start["alive"].copy()
+        pool = self.pool
+        start = pool.start([[own[i] for i in todo] for own, todo in zip(self.seeds, self.todo, strict=True)])
+        self.observations, self.restarted = start["observation"].copy(), start["alive"].copy()
         alive = pool.alive
         self._remember(alive, start["position"][alive], start["observation"][alive])
-        while len(alive):
-            actions = np.empty((len(alive), self.task.action_dim), np.float32)
-            for seat in seats:
-                low, high = np.searchsorted(alive, (seat.low, seat.high))
-                if low < high:
-                    actions[low:high] = self._act(seat, alive[low:high], observations, restarted)
-            records = pool.step(actions)
-            steps = self.lengths[alive]
-            if self.in_use is not None:
-                self.in_use[alive, steps] = self.codes[alive]
-            self.returns[alive] += records["reward"]
-            self.success[alive] |= records["success"]
-            self.lengths[alive] += 1
-            self._remember(alive, records["reached_position"], records["reached"])
-            ended = records["terminated"] | records["truncated"]
-            for row in np.flatnonzero(ended):
-                rows.append(self._finish(alive[row], records[row]))
-                self.report(rows[-1]["success"])
-            again = ended & records["alive"]
-            restarted[:] = False
-            restarted[alive[again]] = True
-            observations[alive] = records["observation"]
-            self._remember(alive[again], records["position"][again], records["observation"][again])
-            alive = pool.alive
+        # Two halves take turns: while the workers step one, the actors act for the other.
+        halves = [alive[alive % 2 == half] for half in (0, 1)] if len(alive) in OVERLAP else [alive]
+        for half in halves:
+            pool.send(half, self._act(seats, half))
+        rows: list[dict[str, Any]] = []
+        while pool.busy:
+            slots, records = pool.receive()
+            rows += self._note(slots, records)
+            more = slots[records["alive"]]
+            if len(more):
+                pool.send(more, self._act(seats, more))
         return rows
 
-    def _act(
-        self, seat: _Seat, slots: NDArray[np.intp], observations: NDArray[Any], restarted: NDArray[np.bool_]
-    ) -> NDArray[np.float32]:
+    def _note(self, slots: NDArray[np.intp], records: NDArray[Any]) -> list[dict[str, Any]]:
+        """Take in one step of some slots: the rows of the episodes that have ended."""
+        if self.in_use is not None:
+            self.in_use[slots, self.lengths[slots]] = self.codes[slots]
+        self.returns[slots] += records["reward"]
+        self.success[slots] |= records["success"]
+        self.lengths[slots] += 1
+        self._remember(slots, records["reached_position"], records["reached"])
+        ended = records["terminated"] | records["truncated"]
+        rows = [self._finish(slots[row], records[row]) for row in np.flatnonzero(ended)]
+        for row in rows:
+            self.report(row["success"])
+        again = ended & records["alive"]
+        self.restarted[slots] = again
+        self.observations[slots] = records["observation"]
+        self._remember(slots[again], records["position"][again], records["observation"][again])
+        return rows
+
+    def _act(self, seats: list[_Seat], slots: NDArray[np.intp]) -> NDArray[np.float32]:
+        """Everybody's actions (n, A) for some live slots, ascending."""
+        actions = np.empty((len(slots), self.task.action_dim), np.float32)
+        for seat in seats:
+            low, high = np.searchsorted(slots, (seat.low, seat.high))
+            if low < high:
+                actions[low:high] = self._act_one(seat, slots[low:high])
+        return actions
+
+    def _act_one(self, seat: _Seat, slots: NDArray[np.intp]) -> NDArray[np.float32]:
         """One actor's actions for its live slots; its codes are noted."""
         rows = slots - seat.low
-        actions = np.asarray(seat.actor.act(observations[slots], restarted[slots], rows), dtype=np.float32)
+        actions = np.asarray(seat.actor.act(self.observations[slots], self.restarted[slots], rows), dtype=np.float32)
         if actions.shape != (len(slots), self.task.action_dim):
             expected = (len(slots), self.task.action_dim)
             raise UserError(f"'{seat.name}' gave actions of shape {actions.shape}, expected {expected}")
@@ -277,9 +298,7 @@ class _Match:
         path = None
         if self.positions is not None and self.in_use is not None:
             seen = None if self.seen is None else self.seen[slot, : length + 1].copy()
-            path = RolloutPath(
-                self.positions[slot, : length + 1].copy(), self.in_use[slot, :length].copy(), seen
-            )
+            path = RolloutPath(self.positions[slot, : length + 1].copy(), self.in_use[slot, :length].copy(), seen)
         row = {
             "actor": contestant.name,
             "label": contestant.labels[episode] if contestant.labels else contestant.name,
@@ -311,6 +330,20 @@ def _episode_seeds(contestant: Contestant, seed: int) -> list[int]:
         seeds.append(episode_seed(seed, counts[label]))
         counts[label] += 1
     return seeds
+
+
+@contextlib.contextmanager
+def _few_threads(workers: int) -> Iterator[None]:
+    """Let torch use only the cores that the workers leave: threads that wait for a core cost far more than
+    they bring."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(min(before, max(1, available_cores() - workers)))
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @contextlib.contextmanager

@@ -37,6 +37,7 @@ class RunSettings:
     seed: int = 0
     preset: str | None = None
     data_steps: int = 200_000
+    clone_steps: int = 4000
     episodes: int | None = None
     episodes_per_skill: int = 20
     selection: str = "sample"
@@ -71,6 +72,7 @@ class Run:
         self.preset = find_preset(settings.preset or self.task.family)
         for name, value in (
             ("data_steps", settings.data_steps),
+            ("clone_steps", settings.clone_steps),
             ("episodes", self.episodes),
             ("episodes_per_skill", settings.episodes_per_skill),
         ):
@@ -97,7 +99,7 @@ class Run:
 
     def _stages(self, stages: Stages, last: int) -> None:
         w = self.wanted
-        origin = {"task": self.task.name, "data": w.data}
+        origin: dict[str, Any] = {"task": self.task.name, "data": w.data}
         if w.data is None:
             origin |= {"steps": w.data_steps, "seed": w.seed}
         else:
@@ -124,8 +126,9 @@ class Run:
         self.policy = stages.do("policy", title, self._essence("policy"), reads, self._policy)
         if last < 4:
             return
-        title = "clone: behaviour cloning, the baseline"
-        self.clone = stages.do("clone", title, {"task": self.task.name, "seed": w.seed}, [data], self._clone)
+        title = f"clone: behaviour cloning, the baseline, {w.clone_steps:,} steps"
+        settings = {"task": self.task.name, "seed": w.seed, "steps": w.clone_steps}
+        self.clone = stages.do("clone", title, settings, [data], self._clone)
         if last < 5:
             return
         settings = {
@@ -231,7 +234,8 @@ class Run:
         """Train the baseline that has no skills."""
         from dds_lightning.study.baselines import fit_clone
 
-        return {"checkpoint": fit_clone(self.task, self.spec, folder, seed=self.wanted.seed)}
+        w = self.wanted
+        return {"checkpoint": fit_clone(self.task, self.spec, folder, seed=w.seed, steps=w.clone_steps)}
 
     def _evaluate(self, folder: Path, resuming: bool) -> dict[str, Any]:
         """Publish the agent and let everyone in the table play."""
@@ -276,11 +280,8 @@ class Run:
     # ---------------------------------------------------------------- what is told at the end
 
     def _report(self, done: list[Done]) -> Report:
-        import pandas as pd
-
-        from dds_lightning.reports import table
-
-        text: list[Any] = []
+        """The table, where failures ended, and where everything lies."""
+        total = sum(stage.seconds for stage in done)
         data: dict[str, Any] = {
             "task": self.task.name,
             "out": self.out,
@@ -290,13 +291,17 @@ class Run:
             "outputs": {stage.name: stage.outputs for stage in done},
         }
         by_name = {stage.name: stage for stage in done}
-        if "evaluate" in by_name:
-            results = pd.DataFrame(by_name["evaluate"].facts["results"])
-            data["results"] = results
-            text.append(table(results, f"{self.task.name}, seed {self.wanted.seed}"))
-        total = sum(stage.seconds for stage in done)
-        text += [f"{name}: {path}" for stage in done for name, path in stage.outputs.items()]
-        text.append(f"{duration(total)} in all, {self.out}")
+        text: list[Any] = []
+        shown = done
+        if "report" in by_name:
+            from dds_lightning.study.report import told
+
+            data |= by_name["report"].facts
+            text += told(by_name["report"].facts)
+            shown = [by_name["report"]]
+            text.append(f"agent: {by_name['evaluate'].outputs['agent']}")
+        text += [f"{name}: {path}" for stage in shown for name, path in stage.outputs.items()]
+        text.append(f"{duration(total)} in all; everything is in {self.out}")
         return Report(data, text)
 
 

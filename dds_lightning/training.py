@@ -52,6 +52,8 @@ class RollingCheckpoint(Checkpoint):
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Count the seconds from here: what lies before cannot be lost."""
+        # Lightning's own SIGTERM handler ends the program between two steps, and nothing is saved.
+        interrupts.take_back()
         self._saved_time = time.monotonic()
         self._saved_step = trainer.global_step
 

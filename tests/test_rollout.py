@@ -16,7 +16,7 @@ from dds_lightning.actors import RandomActor
 from dds_lightning.envpool import EnvPool, EnvPoolError
 from dds_lightning.errors import UserError
 from dds_lightning.results import RolloutResult
-from dds_lightning.rollout import Contestant, episode_seed, rollout
+from dds_lightning.rollout import Contestant, episode_seed, rollout, slots_needed
 from dds_lightning.tasks import get_task
 
 UMAZE = replace(get_task("pointmaze-umaze-diverse"), max_episode_steps=30)
@@ -74,7 +74,9 @@ class Coder(Constant):
 
 
 @pytest.mark.parametrize("slots", [1, 2, 7, 64])
-def test_every_episode_is_played_once_whatever_the_slots(slots):
+@pytest.mark.parametrize("overlap", [True, False])
+def test_every_episode_is_played_once_whatever_the_slots(monkeypatch, slots, overlap):
+    monkeypatch.setattr("dds_lightning.rollout.OVERLAP", range(2, 99) if overlap else ())
     result = rollout(
         TOY, [Contestant("a", Constant(0.5), 11), Contestant("b", Constant(2.0), 6)], workers=0, slots=slots
     )
@@ -174,14 +176,14 @@ def test_summary_counts_by_hand():
     assert RolloutResult("toy", table).summary("label")["label"].tolist() == ["x", "y", "a"]
 
 
-def _maze_table(workers, slots=5):
-    contestants = [Contestant("random", RandomActor(2), 7), Contestant("other", RandomActor(2), 3)]
+def _maze_table(workers, slots=30):
+    contestants = [Contestant("random", RandomActor(2), 23), Contestant("other", RandomActor(2), 9)]
     return rollout(UMAZE, contestants, seed=1, workers=workers, slots=slots).episodes
 
 
 def test_workers_do_not_change_the_table():
     alone = _maze_table(0)
-    assert len(alone) == 10
+    assert len(alone) == 32
     for workers in (1, 2):
         pd.testing.assert_frame_equal(_maze_table(workers), alone)
     pd.testing.assert_frame_equal(_maze_table(0), alone)
@@ -235,6 +237,16 @@ def test_bad_contestants_are_refused_by_name(contestants, message):
         rollout(TOY, contestants, workers=0)
 
 
+def test_a_pool_that_is_too_small_is_used_in_turns_or_refused():
+    players = [Contestant("a", Constant(0.5), 6), Contestant("b", Constant(0.5), 6, ["x", "y"] * 3)]
+    assert slots_needed(players, 8) == 7
+    assert slots_needed(players, 1) == 3
+    with EnvPool(TOY, 4, workers=0) as pool:
+        assert len(rollout(TOY, players, pool=pool, slots=8).episodes) == 12
+    with EnvPool(TOY, 2, workers=0) as pool, pytest.raises(UserError, match=r"has 2 environments.*need at least 3"):
+        rollout(TOY, players, pool=pool)
+
+
 def test_one_actor_cannot_play_twice():
     actor = Constant(0.0)
     with pytest.raises(UserError, match="share one actor"):
@@ -268,10 +280,10 @@ def broken(tmp_path, monkeypatch):
 
 
 def test_a_worker_that_raises_tells_its_caller_why(broken):
-    with EnvPool(broken, 2, workers=2) as pool:
-        pool.start([[0], [1]])
+    with EnvPool(broken, 3, workers=2) as pool:
+        pool.start([[0], [1], [2]])
         with pytest.raises(EnvPoolError, match=r"(?s)worker 0 of 2 \(broken\) failed.*wheel came off"):
-            pool.step(np.zeros((2, 1), np.float32))
+            pool.step(np.zeros((3, 1), np.float32))
         assert pool.closed
 
 
@@ -299,7 +311,7 @@ SCRIPT = """
 import os, signal, sys
 from dds_lightning.envpool import EnvPool
 from dds_lightning.tasks import get_task
-pool = EnvPool(get_task("pointmaze-umaze-diverse"), 2, workers=2)
+pool = EnvPool(get_task("pointmaze-umaze-diverse"), 3, workers=2)
 print(*[part.process.pid for part in pool._parts], "torch" in sys.modules, flush=True)
 os.kill(os.getpid(), signal.SIGKILL)
 """

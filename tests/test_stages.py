@@ -66,7 +66,7 @@ def test_a_changed_setting_of_the_last_stage_leaves_the_first_alone(script):
 
 def test_the_reason_for_doing_a_stage_again_is_told(script):
     script.run()
-    script_console = Console(record=True, quiet=False, file=open("/dev/null", "w"))  # noqa: SIM115, PTH123
+    script_console = Console(record=True, quiet=False, file=open("/dev/null", "w"))  # noqa: SIM115
     stages = Stages(script.root, script_console)
     stages.do("first", "first", {"width": 5}, [], lambda folder, resuming: {})
     assert "width 1 -> 5" in script_console.export_text()
@@ -116,9 +116,9 @@ def test_fresh_does_everything_again(script):
 
 
 def test_two_runs_cannot_share_a_directory(tmp_path):
+    second = locked(tmp_path / "run")
     with locked(tmp_path / "run"), pytest.raises(UserError, match="another `dds run` is working"):
-        with locked(tmp_path / "run"):
-            pass
+        second.__enter__()
 
 
 def test_a_run_that_fails_before_its_first_stage_leaves_no_directory(tmp_path):

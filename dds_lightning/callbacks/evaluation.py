@@ -14,7 +14,7 @@ from dds_lightning.callbacks.resume import undisturbed
 from dds_lightning.envpool import EnvPool
 from dds_lightning.errors import UserError
 from dds_lightning.policy import PolicyModule
-from dds_lightning.rollout import Contestant, RolloutResult, rollout, single_skills
+from dds_lightning.rollout import Contestant, RolloutResult, rollout, single_skills, slots_needed
 from dds_lightning.skill import SkillModule
 from dds_lightning.tasks import Task, get_task
 
@@ -76,9 +76,10 @@ class RolloutEvaluation(Callback):
         """Check the settings; environments are made at the first evaluation."""
         for name, value, least in (
             ("episodes", episodes, 1),
-            ("every_n_steps", every_n_steps or 1, 1),
+            ("every_n_steps", 1 if every_n_steps is None else every_n_steps, 1),
             ("every_n_validations", every_n_validations, 1),
             ("episodes_per_skill", episodes_per_skill, 0),
+            ("slots", slots, 1),
         ):
             if value < least:
                 raise UserError(f"rollout evaluation: {name} is {value}, expected {least} or more")
@@ -102,9 +103,7 @@ class RolloutEvaluation(Callback):
         """Find the task, and refuse checkpoints that would look at other moments than these."""
         self.task = self.task or getattr(getattr(trainer, "datamodule", None), "task", None)
         if self.task is None:
-            raise UserError(
-                "rollout evaluation: task is missing; give the name of a task (`dds tasks` lists them)"
-            )
+            raise UserError("rollout evaluation: task is missing; give the name of a task (`dds tasks` lists them)")
         if stage != "fit" or self.every_n_steps is None:
             return
         for callback in trainer.checkpoint_callbacks:
@@ -124,10 +123,7 @@ class RolloutEvaluation(Callback):
     ) -> None:
         """Evaluate when `every_n_steps` optimiser steps have passed."""
         step = trainer.global_step
-        if (
-            self.every_n_steps is None
-            or step // self.every_n_steps == self._evaluated_step // self.every_n_steps
-        ):
+        if self.every_n_steps is None or step // self.every_n_steps == self._evaluated_step // self.every_n_steps:
             return
         values = self._evaluate(trainer, pl_module)
         pl_module.log_dict(values, on_step=True, on_epoch=False, logger=False)
@@ -158,9 +154,7 @@ class RolloutEvaluation(Callback):
             return players
         if isinstance(pl_module, PolicyModule):
             agents = [
-                DDSAgent(
-                    self._skill_model(trainer, pl_module), pl_module, way, self.temperature, self.noise_scale
-                )
+                DDSAgent(self._skill_model(trainer, pl_module), pl_module, way, self.temperature, self.noise_scale)
                 for way in self.selections
             ]
             return [Contestant(agent.selection, agent, self.episodes) for agent in agents]
@@ -195,10 +189,8 @@ class RolloutEvaluation(Callback):
         assert self.task is not None, "setup comes first"
         players = self.contestants(trainer, pl_module)
         if self._pool is None or self._pool.closed:
-            least = sum(len(set(player.labels or [""])) for player in players)
-            most = sum(player.episodes for player in players)
-            self._pool = EnvPool(self.task, max(least, min(self.slots, most)), self.workers)
-        result = rollout(self.task, players, seed=self.seed, progress=False, pool=self._pool)
+            self._pool = EnvPool(self.task, slots_needed(players, self.slots), self.workers)
+        result = rollout(self.task, players, seed=self.seed, slots=self.slots, progress=False, pool=self._pool)
         self.last = result
         values: dict[str, float] = {}
         for rank, row in enumerate(result.summary().to_dict("records")):
@@ -227,9 +219,7 @@ class RolloutEvaluation(Callback):
         """Close the environments."""
         self._close()
 
-    def on_exception(
-        self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException
-    ) -> None:
+    def on_exception(self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException) -> None:
         """Close the environments."""
         self._close()
 

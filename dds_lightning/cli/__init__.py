@@ -58,9 +58,9 @@ def _dispatch(words: list[str]) -> int:
         else:
             as_json, work = _command(words)
     except ArgumentError as error:
-        known = STAGES.keys() | {"run", "relabel", "evaluate", "data", "tasks"}
+        known = STAGES.keys() | {"run", "relabel", "evaluate", "report", "data", "tasks"}
         asked = shlex.join(["dds", *(words[:1] if words[:1] and words[0] in known else [])])
-        return _complain(f"{str(error.message).strip()} (see `{asked} --help`)")
+        return _complain(f"{error.message} (see `{asked} --help`)")
     except SystemExit as stop:  # --help and --print_config end so
         if isinstance(stop, Interrupted):
             raise
@@ -97,7 +97,7 @@ def _report(work: Callable[[], Any], as_json: bool) -> int:
 
 
 def _complain(message: str) -> int:
-    print(f"dds: error: {message}", file=sys.stderr)
+    print(f"dds: error: {' '.join(message.split())}", file=sys.stderr)
     return USAGE_ERROR
 
 

@@ -17,6 +17,7 @@ def run(
     seed: int = 0,
     preset: str | None = None,
     data_steps: int = 200_000,
+    clone_steps: int = 4000,
     episodes: int | None = None,
     episodes_per_skill: int = 20,
     selection: Literal["sample", "greedy", "argmax_q"] = "sample",
@@ -42,6 +43,7 @@ def run(
         preset: packaged pair of configurations (pointmaze, paper), or a folder with skill.yaml and
             policy.yaml; without it the task family's
         data_steps: environment steps to collect
+        clone_steps: optimiser steps of the behaviour-cloning baseline
         episodes: evaluation episodes of each contestant; without it the task's own number
         episodes_per_skill: evaluation episodes of each single skill alone
         selection: how the published agent chooses skills; the table shows every way
@@ -58,10 +60,11 @@ def run(
         RunSettings(
             task=task,
             out=Path(out or f"runs/{task}"),
-            data=data,
+            data=_spec(data) if data else None,
             seed=seed,
             preset=preset,
             data_steps=data_steps,
+            clone_steps=clone_steps,
             episodes=episodes,
             episodes_per_skill=episodes_per_skill,
             selection=selection,
@@ -105,7 +108,7 @@ def relabel(
 
     module = RelabeledDataModule(
         task,
-        data,
+        _spec(data),
         skill,
         gamma=gamma,
         discount=discount,
@@ -168,8 +171,7 @@ def evaluate(
             "it was trained for another task"
         )
     ways = [
-        way(agent, choice, count, temperature if choice == "sample" else 1.0)
-        for choice in dict.fromkeys(selection)
+        way(agent, choice, count, temperature if choice == "sample" else 1.0) for choice in dict.fromkeys(selection)
     ]
     result = rollout(wanted, ways, seed=seed, workers=workers)
     summary = result.summary()
@@ -183,6 +185,17 @@ def evaluate(
         report.data["episodes"] = out
         report.text.append(out)
     return report
+
+
+def report(directory: str) -> Report:
+    """Draw the report of a finished run once more: table, figures, clip.
+
+    Args:
+        directory: a run of `dds run`
+    """
+    from dds_lightning.study.report import report as draw
+
+    return draw(directory)
 
 
 def data_collect(

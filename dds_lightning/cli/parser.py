@@ -17,6 +17,7 @@ COMMANDS: Commands = {
     "policy": None,
     "relabel": commands.relabel,
     "evaluate": commands.evaluate,
+    "report": commands.report,
     "data": {
         "collect": commands.data_collect,
         "check": commands.data_check,
@@ -41,9 +42,7 @@ def build_parser() -> tuple[ArgumentParser, dict[str, Callable[..., Any]]]:
     return parser, functions
 
 
-def _add(
-    parser: ArgumentParser, table: Commands, functions: dict[str, Callable[..., Any]], prefix: str = ""
-) -> None:
+def _add(parser: ArgumentParser, table: Commands, functions: dict[str, Callable[..., Any]], prefix: str = "") -> None:
     subcommands = parser.add_subcommands(required=True, metavar="COMMAND")
     for name, entry in table.items():
         if entry is None:

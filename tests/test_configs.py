@@ -1,0 +1,80 @@
+"""Every packaged configuration parses against the real signatures, and the paper's hold its tables."""
+
+import pytest
+import yaml
+
+from dds_lightning.configs import ROOT, find, find_preset, packaged, resolve_configs
+from dds_lightning.errors import UserError
+from dds_lightning.fitting import settings_of
+from dds_lightning.tasks import get_task, task_names
+
+
+def _flat(value, prefix=""):
+    if isinstance(value, dict):
+        return {k: v for key, item in value.items() for k, v in _flat(item, f"{prefix}{key}.").items()}
+    return {prefix[:-1]: value}
+
+
+@pytest.mark.parametrize("name", packaged())
+def test_every_packaged_configuration_parses_and_nothing_in_it_is_lost(name):
+    stage = name.split("/")[-1].removesuffix(".yaml")
+    parsed = _flat(settings_of(stage, ["fit", "--config", name]))
+    written = _flat(yaml.safe_load((ROOT / name).read_text()))
+    assert {key: parsed[key] for key in written if not key.startswith("trainer.callbacks")} == {
+        key: value for key, value in written.items() if not key.startswith("trainer.callbacks")
+    }
+
+
+def test_every_family_of_tasks_has_a_preset_and_so_has_the_paper():
+    for family in {get_task(name).family for name in task_names()} | {"paper"}:
+        assert {path.name for path in find_preset(family).values()} == {"skill.yaml", "policy.yaml"}
+
+
+def test_the_papers_skill_settings_are_tables_4_to_6():
+    settings = settings_of("skill", ["fit", "--config", "paper/skill.yaml"])
+    model, data = settings["model"], settings["data"]
+    table_4 = {"encoder_layers": 4, "encoder_heads": 8, "dropout": 0.1, "hidden_dim": 256}
+    table_5 = {"diffusion_steps": 5, "beta_min": 0.1, "beta_max": 10.0, "time_dim": 16, "decoder_blocks": 4}
+    table_6 = {"lr": 5e-5, "skill_dim": 128, "num_skills": 16, "commitment": 0.25}
+    expected = {**table_4, **table_5, **table_6}
+    assert {name: model[name] for name in expected} == expected
+    assert (model["encoder"], model["decoder"], model["bottleneck"]) == ("transformer", "diffusion", "vq")
+    assert (data["batch_size"], data["horizon"]) == (128, 10)
+    assert settings["trainer"]["max_steps"] == 500_000
+
+
+def test_the_papers_policy_settings_are_table_7():
+    settings = settings_of("policy", ["fit", "--config", "paper/policy.yaml", "--data.skill", "none.ckpt"])
+    model, data = settings["model"], settings["data"]
+    expected = {"lr": 1e-4, "tau": 0.7, "target_ema": 0.005, "critic_steps": 1_000_000, "extraction": "after"}
+    assert {name: model[name] for name in expected} == expected
+    assert model["hidden_dims"] == [256, 256]
+    assert (data["batch_size"], data["gamma"], data["discount"]) == (256, 0.99, "per_skill")
+    assert settings["trainer"]["max_steps"] - model["critic_steps"] == 500_000
+
+
+def test_a_packaged_name_is_found_with_and_without_its_ending():
+    assert find("pointmaze/skill") == find("pointmaze/skill.yaml") == ROOT / "pointmaze" / "skill.yaml"
+
+
+def test_a_file_of_the_users_goes_before_a_packaged_one(tmp_path):
+    own = tmp_path / "pointmaze" / "skill.yaml"
+    own.parent.mkdir()
+    own.write_text("model: {}\n")
+    assert find("pointmaze/skill.yaml").resolve() == own.resolve()
+
+
+def test_both_spellings_of_the_option_are_resolved():
+    path = str(ROOT / "paper" / "skill.yaml")
+    assert resolve_configs(["fit", "--config", "paper/skill"]) == ["fit", "--config", path]
+    assert resolve_configs(["fit", "--config=paper/skill"]) == ["fit", f"--config={path}"]
+    assert resolve_configs(["fit", "-c", "paper/skill"]) == ["fit", "-c", path]
+
+
+def test_an_unknown_configuration_or_preset_lists_the_packaged_ones(tmp_path):
+    with pytest.raises(UserError, match=r"no file nope.yaml.*paper/skill.yaml"):
+        find("nope.yaml")
+    with pytest.raises(UserError, match=r"no folder nope.*paper, pointmaze"):
+        find_preset("nope")
+    with pytest.raises(UserError, match=r"has no skill.yaml"):
+        find_preset(str(tmp_path))

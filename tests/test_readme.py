@@ -1,0 +1,63 @@
+"""What README tells people to type exists: every command parses, the cheap ones run."""
+
+import re
+import shlex
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from dds_lightning.cli import main
+from dds_lightning.cli.parser import build_parser, prepare
+from dds_lightning.fitting import settings_of
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+BLOCKS = re.findall(r"^```bash\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL)
+LINES = [line for block in BLOCKS for line in block.replace("\\\n", " ").splitlines() if line.strip()]
+LINES = [line for line in LINES if not line.startswith("#")]
+DDS = [shlex.split(line, comments=True)[1:] for line in LINES if line.startswith("dds ")]
+
+
+def test_there_is_something_to_check():
+    assert len(DDS) >= 5
+
+
+def test_the_first_block_is_the_two_commands():
+    assert BLOCKS[0].split("\n")[:2] == ["make demo", "make test"]
+
+
+@pytest.mark.parametrize("words", [w for w in DDS if w[0] not in ("skill", "policy")], ids=" ".join)
+def test_a_command_of_ours_parses(words):
+    parser, _ = build_parser()
+    parser.parse_args(prepare(words))
+
+
+@pytest.mark.parametrize("words", [w for w in DDS if w[0] in ("skill", "policy")], ids=" ".join)
+def test_a_training_command_parses(words):
+    settings = settings_of(words[0], words[1:])
+    assert settings["data"]["task"] == "pointmaze-large-diverse"
+
+
+@pytest.mark.parametrize("words", [w for w in DDS if w[0] in ("tasks", "--version")], ids=" ".join)
+def test_a_cheap_command_runs(words, capsys):
+    assert main(words) == 0
+    assert capsys.readouterr().out
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+@pytest.mark.parametrize("line", [line for line in LINES if line.startswith("make ")])
+def test_a_make_target_exists(line):
+    ran = subprocess.run(["make", "-n", *line.split()[1:]], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+
+
+def test_every_file_that_readme_links_to_exists():
+    links = re.findall(r"\]\((?!https?:|#)([^)]+)\)", README)
+    assert [link for link in links if not (ROOT / link.split("#")[0]).exists()] == []
+
+
+def test_python_blocks_are_valid_python():
+    for block in re.findall(r"^```python\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL):
+        compile(block, "README.md", "exec")
