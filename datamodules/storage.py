@@ -1,4 +1,4 @@
-"""Trajectories as plain .npy files, which can be memory-mapped when they do not fit into memory."""
+"""Arrays as plain .npy files in one folder, which can be memory-mapped when they do not fit into memory."""
 
 from __future__ import annotations
 
@@ -6,19 +6,23 @@ import json
 import os
 import shutil
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from datamodules.trajectories import ARRAY_TYPES, Trajectories
 from datamodules.validation import DataError
 from dds_lightning.errors import UserError
 
 FORMAT = 1
 
 
-def save_trajectories(trajectories: Trajectories, directory: str | Path, *, overwrite: bool = False) -> Path:
-    """Write `directory` with one .npy file an array and `trajectories.json` (name, format, fingerprint).
+def save_arrays(
+    directory: str | Path, arrays: Mapping[str, NDArray[Any]], facts: Mapping[str, Any], *, overwrite: bool = False
+) -> Path:
+    """Write `directory` with one .npy file an array and `trajectories.json`, which holds `facts` and the format.
 
     Everything goes into a hidden sibling folder first, so that the folder is whole or absent.
 
@@ -31,13 +35,12 @@ def save_trajectories(trajectories: Trajectories, directory: str | Path, *, over
     partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", suffix=".partial", dir=folder.parent))
     try:
         partial.chmod(0o755)
-        for key, array in trajectories.arrays().items():
+        for key, array in arrays.items():
             with (partial / f"{key}.npy").open("wb") as file:
                 np.save(file, array, allow_pickle=False)
                 file.flush()
                 os.fsync(file.fileno())
-        facts = {"format": FORMAT, "name": trajectories.name, "fingerprint": trajectories.fingerprint()}
-        write_durably(partial / "trajectories.json", json.dumps(facts, indent=1))
+        write_durably(partial / "trajectories.json", json.dumps({"format": FORMAT, **facts}, indent=1))
         put_in_place(partial, folder, overwrite)
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
@@ -45,27 +48,32 @@ def save_trajectories(trajectories: Trajectories, directory: str | Path, *, over
     return folder
 
 
-def read_trajectories(directory: str | Path, *, mmap: bool = False, verify: bool = True) -> Trajectories:
-    """Read what `save_trajectories` wrote.
+def read_arrays(
+    directory: str | Path, types: Mapping[str, Any], *, mmap: bool = False
+) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Read what `save_arrays` wrote.
 
     Args:
         directory: The folder.
+        types: The arrays to read and their types.
         mmap: Map the arrays instead of reading them: memory is filled as they are used.
-        verify: Compare with the stored fingerprint, which reads everything once.
+
+    Returns:
+        The facts and the arrays.
 
     Raises:
-        DataError: When a file is missing, damaged or does not match.
+        DataError: When a file is missing, damaged or of another type.
     """
     folder = Path(directory).expanduser()
     try:
         facts = json.loads((folder / "trajectories.json").read_text(encoding="utf-8"))
-        name, version, fingerprint = str(facts["name"]), facts["format"], facts["fingerprint"]
+        name, version, _ = str(facts["name"]), facts["format"], facts["fingerprint"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"data: {folder / 'trajectories.json'} is missing or damaged ({error!r})") from error
     if version != FORMAT:
         raise DataError(f"data set '{name}': its format is {version}, expected {FORMAT}; write it again")
     arrays = {}
-    for key, dtype in ARRAY_TYPES.items():
+    for key, dtype in types.items():
         path = folder / f"{key}.npy"
         try:
             arrays[key] = np.load(path, mmap_mode="r" if mmap else None, allow_pickle=False)
@@ -73,17 +81,7 @@ def read_trajectories(directory: str | Path, *, mmap: bool = False, verify: bool
             raise DataError(f"data set '{name}': {path} is missing, truncated or damaged ({error})") from error
         if arrays[key].dtype != dtype:
             raise DataError(f"data set '{name}', {key}: found type {arrays[key].dtype}, expected {np.dtype(dtype)}")
-    steps, episodes = len(arrays["rewards"]), len(arrays["lengths"])
-    rows = {"actions": steps, "terminations": steps, "truncations": steps, "observations": steps + episodes}
-    for key, expected in rows.items():
-        if len(arrays[key]) != expected:
-            raise DataError(f"data set '{name}', {key}: found {len(arrays[key])} rows, expected {expected}")
-    if arrays["lengths"].sum() != steps:
-        raise DataError(f"data set '{name}', lengths: they add up to {arrays['lengths'].sum()}, expected {steps}")
-    trajectories = Trajectories(name=name, **arrays)
-    if verify and trajectories.fingerprint() != fingerprint:
-        raise DataError(f"data set '{name}': the arrays in {folder} do not match their fingerprint; they were changed")
-    return trajectories
+    return facts, arrays
 
 
 def refuse_existing(folder: Path, overwrite: bool) -> None:

@@ -34,6 +34,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from datamodules.storage import read_arrays, save_arrays
 from datamodules.validation import DataError, validate_episode
 from datamodules.windows import Windows, ranges, sliding_windows
 
@@ -258,22 +259,42 @@ class Trajectories:
 
     def windows(self, horizon: int, stride: int = 1, tail: Literal["full", "terminated"] = "full") -> Windows:
         """Sliding windows of `horizon` steps; see `datamodules.windows.sliding_windows`."""
-        return sliding_windows(self, horizon, stride, tail)
+        terminated = self.terminations[self.step_offsets[1:] - 1]
+        return sliding_windows(self.name, self.lengths, terminated, horizon, stride, tail)
 
     # ------------------------------------------------------------------ on disk
 
     def save(self, directory: str | Path, *, overwrite: bool = False) -> Path:
         """Write a folder of .npy files, whole or not at all; see `datamodules.storage`."""
-        from datamodules.storage import save_trajectories
-
-        return save_trajectories(self, directory, overwrite=overwrite)
+        facts = {"name": self.name, "fingerprint": self.fingerprint()}
+        return save_arrays(directory, self.arrays(), facts, overwrite=overwrite)
 
     @classmethod
     def load(cls, directory: str | Path, *, mmap: bool = False, verify: bool = True) -> Trajectories:
-        """Read what `save` wrote. See `datamodules.storage.read_trajectories`."""
-        from datamodules.storage import read_trajectories
+        """Read what `save` wrote.
 
-        return read_trajectories(directory, mmap=mmap, verify=verify)
+        Args:
+            directory: The folder.
+            mmap: Map the arrays instead of reading them: memory is filled as they are used.
+            verify: Compare with the stored fingerprint, which reads everything once.
+
+        Raises:
+            DataError: When a file is missing, damaged or does not match.
+        """
+        facts, arrays = read_arrays(directory, ARRAY_TYPES, mmap=mmap)
+        name, steps, episodes = str(facts["name"]), len(arrays["rewards"]), len(arrays["lengths"])
+        rows = {"actions": steps, "terminations": steps, "truncations": steps, "observations": steps + episodes}
+        for key, expected in rows.items():
+            if len(arrays[key]) != expected:
+                raise DataError(f"data set '{name}', {key}: found {len(arrays[key])} rows, expected {expected}")
+        if arrays["lengths"].sum() != steps:
+            raise DataError(f"data set '{name}', lengths: they add up to {arrays['lengths'].sum()}, expected {steps}")
+        trajectories = cls(name=name, **arrays)
+        if verify and trajectories.fingerprint() != facts["fingerprint"]:
+            raise DataError(
+                f"data set '{name}': the arrays in {directory} do not match their fingerprint; they were changed"
+            )
+        return trajectories
 
 
 def _width(value: Any) -> int | None:

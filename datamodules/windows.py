@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.validation import DataError
-
-if TYPE_CHECKING:
-    from datamodules.trajectories import Trajectories
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +34,9 @@ class Windows:
 
 
 def sliding_windows(
-    trajectories: Trajectories,
+    name: str,
+    lengths: NDArray[np.int64],
+    terminated: NDArray[np.bool_],
     horizon: int,
     stride: int = 1,
     tail: Literal["full", "terminated"] = "full",
@@ -53,7 +52,9 @@ def sliding_windows(
                                       └      h = 1: only with tail = "terminated"
 
     Args:
-        trajectories: The data.
+        name: Of the data set, for messages.
+        lengths: (E,) steps of each episode.
+        terminated: (E,) whether each episode ends in a termination.
         horizon: H, steps of a window.
         stride: Steps between the starts of two windows of one episode; H divides episodes into separate
             parts.
@@ -69,17 +70,15 @@ def sliding_windows(
         raise DataError(f"horizon and stride: found {horizon} and {stride}, expected at least 1")
     if tail not in ("full", "terminated"):
         raise DataError(f"tail: found '{tail}', expected 'full' or 'terminated'")
-    lengths, offsets = trajectories.lengths, trajectories.step_offsets
-    ended = trajectories.terminations[offsets[1:] - 1]
     # Windows may start at 0, stride, 2 * stride, ... up to (not including) this step of the episode.
     stop = np.maximum(lengths - horizon + 1, 0)
     if tail == "terminated":
-        stop = np.where(ended, lengths, stop)
+        stop = np.where(terminated, lengths, stop)
     counts = -(-stop // stride)
-    _report_short(trajectories, horizon, counts == 0)
+    _report_short(name, lengths, horizon, counts == 0)
     episodes = np.repeat(np.arange(len(lengths)), counts)
     local = ranges(np.zeros_like(counts), counts) * stride
-    starts = offsets[episodes] + local
+    starts = (np.cumsum(lengths) - lengths)[episodes] + local
     return Windows(
         starts=starts,
         observation_starts=starts + episodes,
@@ -88,10 +87,9 @@ def sliding_windows(
     )
 
 
-def _report_short(trajectories: Trajectories, horizon: int, dropped: NDArray[np.bool_]) -> None:
+def _report_short(name: str, lengths: NDArray[np.int64], horizon: int, dropped: NDArray[np.bool_]) -> None:
     if not dropped.any():
         return
-    name, lengths = trajectories.name, trajectories.lengths
     if dropped.all():
         raise DataError(
             f"data set '{name}': horizon {horizon} is longer than every one of the {len(lengths)} episodes "
@@ -99,7 +97,7 @@ def _report_short(trajectories: Trajectories, horizon: int, dropped: NDArray[np.
         )
     warnings.warn(
         f"data set '{name}': {int(dropped.sum())} of {len(lengths)} episodes are shorter than horizon "
-        f"{horizon} and are left out ({int(lengths[dropped].sum())} of {trajectories.num_steps} steps)",
+        f"{horizon} and are left out ({int(lengths[dropped].sum())} of {lengths.sum()} steps)",
         stacklevel=4,
     )
 

@@ -279,6 +279,16 @@ def test_relabelling_and_a_policy_upon_it(dds, data, of_data, skill):
     assert (trained["observation_dim"], trained["num_skills"], trained["hidden_dims"]) == (4, 4, [16])
 
 
+def test_the_policy_that_scores_best_while_training_is_kept(dds, of_data, skill):
+    rollouts = "dds_lightning.callbacks.RolloutEvaluation"
+    fit = ["policy", "fit", *of_data, f"--data.skill={skill}", "--data.cache=.", *QUIET, "--model.hidden_dims=[16]"]
+    fit += [f"--trainer.callbacks+={rollouts}", "--trainer.callbacks.episodes=2", "--trainer.callbacks.workers=0"]
+    fit += ["--trainer.max_steps=4", "--trainer.val_check_interval=2", "--trainer.check_val_every_n_epoch=null"]
+    made = dds(*fit, "--best.monitor=rollout/success", "--checkpoint.dirpath=out", "--json").json
+    assert Path(made["best"]).resolve() == Path("out/best.ckpt").resolve()
+    assert 0 <= made["metrics"]["rollout/success"] <= 100
+
+
 def test_a_relabelled_file_of_another_checkpoint_is_refused(dds, data, of_data, skill):
     dds("relabel", skill, data, "--task", TASK, "--out", "relabelled.safetensors")
     words = [*of_data, *TINY, *QUIET, "--trainer.max_steps=1", "--checkpoint.dirpath=other"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datamodules.storage import read_trajectories
 from datamodules.trajectories import Trajectories
 from datamodules.validation import DataError
 from dds_lightning.tasks import Task
@@ -14,7 +13,7 @@ def load_arrays(directory: str, task: Task | None) -> Trajectories:
     Raises:
         DataError: When a file is damaged or a width is another task's.
     """
-    trajectories = read_trajectories(directory, mmap=True)
+    trajectories = Trajectories.load(directory, mmap=True)
     if task is not None:
         for what, found, expected in (
             ("observations", trajectories.observation_dim, task.observation_dim),

@@ -68,3 +68,5 @@ def _curve(ax: Axes, table: pd.DataFrame, column: str, label: str) -> None:
             linewidth=1.2,
             marker="." if len(points) < 12 else "",
         )
+        if column.endswith("codes_used"):  # a count: from none
+            ax.set_ylim(bottom=0.0)

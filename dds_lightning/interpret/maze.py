@@ -1,87 +1,60 @@
 """Figures over a maze: where skills lead, how the policy stitches them, where it fails, what it believes.
 
 Every function takes a table of episodes and recorded paths, as `rollout(..., record=True)` gives and
-`RolloutResult.load` reads back, and returns a matplotlib figure.
+`RolloutResult.load` reads back, and returns a matplotlib figure. Sizes are for 7 inches of width and still readable
+when printed over one column of 3.5 inches.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PatchCollection
+from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from dds_lightning.errors import UserError
-from dds_lightning.interpret.palette import GOAL, NO_SKILL, START, WALL, skill_colour
+from dds_lightning.interpret.drawing import (
+    LABEL,
+    draw_number,
+    draw_path,
+    draw_starts,
+    draw_trail,
+    draw_walls,
+    frame,
+    grid,
+    heading,
+    panel_height,
+    zoom,
+)
+from dds_lightning.interpret.palette import GOAL, START, START_EDGE, skill_colour
 from dds_lightning.results import RolloutPath, RolloutResult
 from dds_lightning.tasks import Task
 
 ValueFunction = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 """Observations (N, O) to values (N,)."""
 
+REACH = 2.5
+"""Half a side of the window round a start, in cells."""
+BANDS = 12
+"""Colours of the value map."""
 
-def draw_walls(ax: Axes, task: Task, goal: bool = True) -> None:
-    """Draw the maze, one square a wall cell, with axes in metres and the goal's circle.
+
+def _rows_of(result: RolloutResult, actor: str) -> Any:
+    """The rows of one contestant.
 
     Raises:
-        UserError: the task has no maze.
+        UserError: no such contestant.
     """
-    if task.maze_map is None:
-        raise UserError(f"task '{task.name}' has no maze to draw; use the table of its report instead")
-    half = task.cell_size / 2
-    squares = [
-        Rectangle(tuple(task.cell_to_xy((i, j)) - half), task.cell_size, task.cell_size)
-        for i, row in enumerate(task.maze_map)
-        for j, value in enumerate(row)
-        if value == "1"
-    ]
-    ax.add_collection(PatchCollection(squares, facecolor=WALL, edgecolor="white", linewidth=0.3, zorder=0))
-    last = (len(task.maze_map) - 1, len(task.maze_map[0]) - 1)
-    (left, bottom), (right, top) = task.cell_to_xy((last[0], 0)) - half, task.cell_to_xy((0, last[1])) + half
-    ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="x (m)", ylabel="y (m)")
-    ax.tick_params(labelsize=7)
-    if goal:
-        centre = tuple(task.goal_xy())
-        ax.add_patch(Circle(centre, task.goal_radius, facecolor=GOAL, alpha=0.18, zorder=1))
-        ax.add_patch(Circle(centre, task.goal_radius, fill=False, edgecolor=GOAL, linewidth=1.2, zorder=5))
-
-
-def draw_path(ax: Axes, path: RolloutPath, numbers: bool = False, linewidth: float = 1.0) -> None:
-    """Draw one path coloured by the skill in use; with ``numbers`` write each code where it takes over."""
-    positions, codes = np.asarray(path.positions), np.asarray(path.codes)
-    pieces = np.stack([positions[:-1], positions[1:]], axis=1)  # (T, 2, 2)
-    colours = [skill_colour(int(code)) for code in codes]
-    ax.add_collection(LineCollection(list(pieces), colors=colours, linewidths=linewidth, zorder=2))
-    if numbers:
-        changes = np.flatnonzero(np.diff(codes, prepend=codes[0] - 1))
-        written = np.full(2, np.inf)
-        for t in changes:
-            if np.linalg.norm(positions[t] - written) < 0.45:
-                continue  # numbers on top of each other tell nothing
-            written = positions[t]
-            _number(ax, positions[t], int(codes[t]))
-
-
-def _number(ax: Axes, xy: NDArray[Any], code: int, size: float = 5.5) -> None:
-    box = {
-        "boxstyle": "circle,pad=0.15",
-        "facecolor": skill_colour(code),
-        "edgecolor": "white",
-        "linewidth": 0.4,
-    }
-    ax.annotate(
-        str(code), tuple(xy), color="white", fontsize=size, ha="center", va="center", bbox=box, zorder=6
-    )
-
-
-def _start(ax: Axes, xy: NDArray[Any]) -> None:
-    ax.plot(
-        *xy, marker="*", markersize=9, color=START, markeredgecolor="#7a3b00", markeredgewidth=0.5, zorder=7
-    )
+    table = result.episodes[result.episodes["actor"] == actor]
+    if table.empty:
+        known = ", ".join(result.episodes["actor"].unique())
+        raise UserError(f"there is no contestant '{actor}' in the table, only {known}")
+    return table
 
 
 def _paths_of(result: RolloutResult, actor: str) -> list[tuple[Any, RolloutPath]]:
@@ -90,13 +63,9 @@ def _paths_of(result: RolloutResult, actor: str) -> list[tuple[Any, RolloutPath]
     Raises:
         UserError: no such contestant, or nothing was recorded of it.
     """
-    table = result.episodes[result.episodes["actor"] == actor]
-    if table.empty:
-        known = ", ".join(result.episodes["actor"].unique())
-        raise UserError(f"there is no contestant '{actor}' in the table, only {known}")
     rows = [
         (row, result.paths[actor, int(row.episode)])
-        for row in table.itertuples()
+        for row in _rows_of(result, actor).itertuples()
         if (actor, int(row.episode)) in result.paths
     ]
     if not rows:
@@ -104,36 +73,31 @@ def _paths_of(result: RolloutResult, actor: str) -> list[tuple[Any, RolloutPath]
     return rows
 
 
-def _usage_legend(ax: Axes, codes: NDArray[Any]) -> None:
-    """A legend of the codes in use, most used first, with their share of the steps."""
-    values, counts = np.unique(codes[codes >= 0], return_counts=True)
-    order = np.argsort(-counts)
-    handles = [
-        Line2D(
-            [],
-            [],
-            color=skill_colour(int(values[i])),
-            linewidth=3,
-            label=f"{values[i]}: {counts[i] / counts.sum():.0%}",
-        )
-        for i in order
-    ]
-    if handles:
-        ax.legend(
-            handles=handles,
-            title="skill: share",
-            loc="upper left",
-            bbox_to_anchor=(1.01, 1.0),
-            fontsize=6,
-            title_fontsize=6.5,
-            frameon=False,
-            labelspacing=0.25,
-        )
+def _legend(ax: Axes, title: str, codes: NDArray[Any], label: Callable[[int, float], str], start: bool) -> None:
+    """Beside the maze: its marks, then the codes with how often they occur, the commonest first."""
+    mark = partial(Line2D, [], [], linestyle="")
+    handles = [mark(marker="*", markersize=11, color=START, markeredgecolor=START_EDGE, label="start")] if start else []
+    handles.append(mark(marker="o", markersize=9, markerfacecolor="none", markeredgecolor=GOAL, label="goal"))
+    values, counts = np.unique(codes, return_counts=True)
+    for i in np.argsort(-counts, kind="stable"):
+        text = label(int(counts[i]), counts[i] / counts.sum())
+        name = f"{values[i]}: {text}" if values[i] >= 0 else f"no skill: {text}"
+        handles.append(Line2D([], [], color=skill_colour(int(values[i])), linewidth=4, label=name))
+    ax.legend(
+        handles=handles,
+        title=title,
+        loc="upper left",
+        bbox_to_anchor=(1.01, 1.015),
+        borderaxespad=0.0,
+        fontsize=9.5,
+        title_fontsize=9.5,
+        frameon=False,
+        labelspacing=0.25,
+        handlelength=1.2,
+    )
 
 
-def plot_trajectories(
-    task: Task, result: RolloutResult, actor: str, episodes: int = 12, numbered: int = 1
-) -> Figure:
+def plot_trajectories(task: Task, result: RolloutResult, actor: str, episodes: int = 12, numbered: int = 1) -> Figure:
     """Episodes of one contestant over the maze, coloured by the skill in use (figure 4 d and h of the paper).
 
     Args:
@@ -142,50 +106,80 @@ def plot_trajectories(
         actor: the contestant.
         episodes: how many paths to draw; successful ones first.
         numbered: on how many of them the codes are written.
+
+    Raises:
+        UserError: no such contestant, or no recorded paths of it.
     """
     rows = sorted(_paths_of(result, actor), key=lambda row: not row[0].success)[:episodes]
-    figure = Figure(figsize=(7.0, 4.4), layout="constrained")
+    figure = Figure(figsize=(7.0, 4.7), layout="constrained")
     ax = figure.add_subplot()
     draw_walls(ax, task)
-    for index, (_, path) in enumerate(rows):
-        draw_path(ax, path, numbers=index < numbered, linewidth=1.1)
-        _start(ax, path.positions[0])
-    table = result.episodes[result.episodes["actor"] == actor]
-    ax.set_title(
-        f"{actor}: {table['success'].mean():.0%} of {len(table)} episodes reach the goal ({len(rows)} drawn)",
-        fontsize=9,
-    )
-    _usage_legend(ax, np.concatenate([path.codes for _, path in rows]))
+    for index, (_, path) in reversed(list(enumerate(rows))):  # those with numbers come last, on top
+        draw_path(ax, path, numbers=index < numbered, linewidth=1.6)
+    draw_starts(ax, [path.positions[0] for _, path in rows], task.cell_size, size=16)
+    table = _rows_of(result, actor)
+    share = f"{table['success'].mean():.0%} of {len(table)} episodes reach the goal ({len(rows)} drawn)"
+    ax.set_title(f"{actor}: {share}", fontsize=LABEL)
+    codes = np.concatenate([path.codes for _, path in rows])
+    _legend(ax, "skill: share", codes, lambda _, share: f"{share:.0%}", start=True)
     return figure
 
 
-def plot_single_skills(
-    task: Task, result: RolloutResult, actor: str = "single skill", steps: int = 150
-) -> Figure:
-    """Each skill replayed alone, one panel a skill (figure 4 a to c of the paper).
+def plot_single_skills(task: Task, result: RolloutResult, actor: str = "single skill", steps: int = 150) -> Figure:
+    """Each skill alone in the task itself, one panel a skill.
 
     Args:
         task: the maze.
-        result: table and paths; the contestant's labels are "skill 0", "skill 1", ...
+        result: table and paths; every episode of the contestant keeps to one skill.
         actor: the contestant whose every part is one skill.
         steps: how much of each replay to draw; later ones only pile up against a wall.
+
+    Raises:
+        UserError: no such contestant, or no recorded paths of it.
     """
     groups: dict[int, list[tuple[Any, RolloutPath]]] = {}
     for row, path in _paths_of(result, actor):
         groups.setdefault(int(path.codes[0]), []).append((row, path))
-    figure, axes = _grid(len(groups), task)
-    for ax, (code, rows) in zip(axes, sorted(groups.items()), strict=False):
+    figure, axes = grid(len(groups), 1.75, panel_height(task, 1.75))
+    for ax, (code, rows) in zip(axes, sorted(groups.items()), strict=True):
         draw_walls(ax, task)
         for _, path in rows:
-            cut = RolloutPath(path.positions[: steps + 1], path.codes[:steps])
-            draw_path(ax, cut, linewidth=0.9)
-            _start(ax, path.positions[0])
+            draw_path(ax, RolloutPath(path.positions[: steps + 1], path.codes[:steps]), linewidth=1.0)
+        draw_starts(ax, [path.positions[0] for _, path in rows], task.cell_size, size=8)
         success = np.mean([bool(row.success) for row, _ in rows])
-        ax.set_title(
-            f"skill {code}, alone {success:.0%}", fontsize=7, color=skill_colour(code), fontweight="bold"
-        )
-        ax.set(xlabel="", ylabel="", xticks=[], yticks=[])
-    figure.suptitle(f"Each skill alone, first {steps} steps from every start", fontsize=9)
+        heading(ax, code, f"{success:.0%} reach the goal")
+    frame(figure, axes, task, f"Each skill alone from the task's start, first {steps} steps")
+    return figure
+
+
+def plot_starts_by_skill(
+    task: Task,
+    starts: NDArray[Any],
+    positions: NDArray[Any],
+    codes: NDArray[Any],
+    alive: NDArray[Any] | None = None,
+) -> Figure:
+    """Each skill from several starts, one panel a skill (figure 4 a to c and e to g of the paper).
+
+    Args:
+        task: the maze.
+        starts: (N, 2) metres, where each replay was put.
+        positions: (N, T + 1, 2) metres.
+        codes: (N,) the skill of each replay.
+        alive: (N, T) False after a replay's end; all True without it.
+    """
+    shown = np.unique(codes)
+    figure, axes = grid(len(shown), 1.75, panel_height(task, 1.75))
+    lengths = _lengths(positions, alive)
+    for ax, code in zip(axes, shown, strict=True):
+        draw_walls(ax, task, goal=False)
+        members = np.flatnonzero(np.asarray(codes) == code)
+        for n in members:
+            draw_trail(ax, positions[n, : lengths[n] + 1], int(code), 1.3)
+        draw_starts(ax, [positions[n, 0] for n in members], task.cell_size, size=7)
+        heading(ax, int(code))
+    places = len(np.unique(np.asarray(starts), axis=0))
+    frame(figure, axes, task, f"Each skill alone from {places} starts, {positions.shape[1] - 1} steps")
     return figure
 
 
@@ -196,63 +190,78 @@ def plot_skills_by_start(
     codes: NDArray[Any],
     alive: NDArray[Any] | None = None,
 ) -> Figure:
-    """All skills from each of several starts, one panel a start (figure 4 a to c and e to g of the paper).
+    """All skills from each of several starts, one panel a start, seen from near.
 
     Args:
         task: the maze.
-        starts: (N, 2) where each replay began; equal rows share a panel.
+        starts: (N, 2) metres, where each replay was put; equal rows share a panel.
         positions: (N, T + 1, 2) metres.
         codes: (N,) the skill of each replay.
         alive: (N, T) False after a replay's end; all True without it.
     """
     places, panel = np.unique(np.asarray(starts), axis=0, return_inverse=True)
-    panel = np.ravel(panel)
-    figure, axes = _grid(len(places), task, width=2.6)
-    for index, ax in enumerate(axes[: len(places)]):
-        draw_walls(ax, task, goal=False)
-        for n in np.flatnonzero(panel == index):
-            steps = positions.shape[1] - 1 if alive is None else int(alive[n].sum())
-            ax.plot(*positions[n, : steps + 1].T, color=skill_colour(int(codes[n])), linewidth=1.0, zorder=2)
-            _number(ax, positions[n, steps], int(codes[n]), size=5)
-        _start(ax, places[index])
-        ax.set(xlabel="", ylabel="", xticks=[], yticks=[])
-    figure.suptitle("Every skill from the same start: one panel a start", fontsize=9)
+    figure, axes = grid(len(places), 2.4, 2.45)
+    lengths = _lengths(positions, alive)
+    for index, ax in enumerate(axes):
+        draw_walls(ax, task)
+        members = np.flatnonzero(np.ravel(panel) == index)
+        for n in members:
+            draw_trail(ax, positions[n, : lengths[n] + 1], int(codes[n]), 1.6)
+        for n in members:  # above every path
+            draw_number(ax, positions[n, lengths[n]], int(codes[n]), size=6.5)
+        draw_starts(ax, [positions[n, 0] for n in members], task.cell_size, size=19)
+        zoom(ax, task, places[index], REACH * task.cell_size)
+        ax.tick_params(labelsize=8)
+        ax.xaxis.get_label().set_fontsize(9)
+        ax.yaxis.get_label().set_fontsize(9)
+        ax.label_outer()
+        ax.tick_params(labelbottom=True, labelleft=True)
+    steps = positions.shape[1] - 1
+    figure.suptitle(f"Every skill alone from the same start, {steps} steps; one panel a start", fontsize=LABEL)
     return figure
 
 
-def _grid(count: int, task: Task, width: float = 1.8) -> tuple[Figure, list[Axes]]:
-    """A figure of ``count`` equal maze panels."""
-    columns = min(4, count)
-    rows = -(-count // columns)
-    assert task.maze_map is not None
-    height = width * len(task.maze_map) / len(task.maze_map[0]) + 0.25
-    figure = Figure(figsize=(columns * width, rows * height + 0.4), layout="constrained")
-    axes = list(np.ravel(figure.subplots(rows, columns, squeeze=False)))
-    for ax in axes[count:]:
-        ax.set_visible(False)
-    return figure, axes
+def _lengths(positions: NDArray[Any], alive: NDArray[Any] | None) -> NDArray[np.int64]:
+    """Steps (N,) that each replay lasted."""
+    if alive is None:
+        return np.full(len(positions), positions.shape[1] - 1)
+    return np.asarray(alive).sum(axis=1)
 
 
 def plot_failures(task: Task, result: RolloutResult, actor: str) -> Figure:
-    """Where the failed episodes of a contestant ended, with the skill in use there; all ends when none failed."""
-    table = result.episodes[result.episodes["actor"] == actor]
-    if table.empty:
-        raise UserError(f"there is no contestant '{actor}' in the table")
+    """Where the failed episodes of a contestant ended, with the skill in use there; all ends when none failed.
+
+    A dot is one end, the bold number in a cell counts them.
+
+    Raises:
+        UserError: no such contestant.
+    """
+    table = _rows_of(result, actor)
     failed = table[~table["success"].astype(bool)]
     shown = failed if len(failed) else table
-    figure = Figure(figsize=(6.2, 4.4), layout="constrained")
+    figure = Figure(figsize=(7.0, 4.7), layout="constrained")
     ax = figure.add_subplot()
     draw_walls(ax, task)
-    for row in shown.itertuples():
-        _number(
-            ax, np.array([row.final_x, row.final_y]), int(row.final_code)
-        ) if row.final_code >= 0 else ax.plot(row.final_x, row.final_y, "o", color=NO_SKILL, markersize=4)
-    title = (
-        f"{actor}: where {len(failed)} of {len(table)} episodes failed"
-        if len(failed)
-        else f"{actor}: no episode of {len(table)} failed; where they ended"
-    )
-    ax.set_title(title + " (number: skill in use)", fontsize=9)
+    ends, codes = shown[["final_x", "final_y"]].to_numpy(), shown["final_code"].to_numpy()
+    colours = [skill_colour(int(code)) for code in codes]
+    ax.scatter(ends[:, 0], ends[:, 1], s=30, c=colours, edgecolors="white", linewidths=0.4, zorder=3)
+    written = np.empty((0, 2))
+    for end, code in zip(ends, codes, strict=True):
+        if code >= 0 and np.all(np.linalg.norm(end - written, axis=1) >= 0.3):  # there is room for a number
+            written = np.concatenate([written, end[None]])
+            draw_number(ax, end, int(code), size=8)
+    cells, counts = np.unique(task.xy_to_cell(ends), axis=0, return_counts=True)
+    for cell, count in zip(cells, counts, strict=True):
+        x, y = task.cell_to_xy(cell)
+        style = {"fontsize": LABEL, "fontweight": "bold", "ha": "center", "va": "center"}
+        text = ax.text(x, y, f"{count}×", zorder=8, **style)  # above the ends: half hidden, 16 would read as 6
+        text.set_path_effects([withStroke(linewidth=3.0, foreground="white")])
+    if len(failed):
+        title = f"{actor}: where {len(failed)} of {len(table)} episodes failed"
+    else:
+        title = f"{actor}: no episode of {len(table)} failed; where they ended"
+    ax.set_title(title, fontsize=LABEL)
+    _legend(ax, "skill in use", codes, lambda count, _: f"{count}×", start=False)
     return figure
 
 
@@ -265,6 +274,9 @@ def plot_value_map(
 ) -> Figure:
     """V over the free cells, the body at rest, with the chosen code and where it leads.
 
+    Each colour covers the same area of the maze, so that the slope is seen far from the goal too, where a
+    discounted value is small; the colour bar has the values at which they change.
+
     Args:
         task: the maze.
         value: observations (N, O) to V (N,); position first, every other entry 0.
@@ -272,49 +284,38 @@ def plot_value_map(
         directions: (K, 2) mean displacement of each code in metres, for the arrows.
         resolution: points a cell on each axis.
     """
-    figure = Figure(figsize=(7.0, 4.6), layout="constrained")
+    figure = Figure(figsize=(7.0, 4.7), layout="constrained")
     ax = figure.add_subplot()
     draw_walls(ax, task)
+    limits = ax.get_xlim(), ax.get_ylim()
     half = task.cell_size / 2
     offsets = (np.arange(resolution) + 0.5) / resolution * task.cell_size - half
     cells = [task.cell_to_xy(cell) for cell in task.free_cells()]
-    grids = [np.stack(np.meshgrid(offsets, offsets), axis=-1) + centre for centre in cells]  # (R, R, 2) each
-    points = np.concatenate([grid.reshape(-1, 2) for grid in grids])
-    values = np.asarray(value(_at_rest(task, points))).reshape(len(cells), resolution, resolution)
-    low, high = float(values.min()), float(values.max())
-    image = None
+    patches = [np.stack(np.meshgrid(offsets, offsets), axis=-1) + centre for centre in cells]  # (R, R, 2) each
+    points = np.concatenate([patch.reshape(-1, 2) for patch in patches])
+    values = np.asarray(value(_at_rest(task, points)), dtype=float).reshape(len(cells), resolution, resolution)
+    edges = np.unique(np.quantile(values, np.linspace(0, 1, BANDS + 1)))
+    if len(edges) < 2:  # the same everywhere
+        edges = edges[0] + np.array([-0.5, 0.5])
+    norm = BoundaryNorm(edges, 256)
     for centre, patch in zip(cells, values, strict=True):
-        extent = (centre[0] - half, centre[0] + half, centre[1] - half, centre[1] + half)
-        image = ax.imshow(
-            patch, extent=extent, origin="lower", cmap="viridis", vmin=low, vmax=high, zorder=0.5
-        )
-    draw_limits = ax.get_xlim(), ax.get_ylim()
-    if image is not None:
-        figure.colorbar(image, ax=ax, shrink=0.8, label="V(s), learning reward")
+        sides = (centre[0] - half, centre[0] + half, centre[1] - half, centre[1] + half)
+        image = ax.imshow(patch, extent=sides, origin="lower", cmap="viridis", norm=norm, zorder=0.5)
+    bar = figure.colorbar(image, ax=ax, shrink=0.9, spacing="uniform", ticks=edges, format="%.3g")
+    bar.set_label("V(s), discounted learning reward", fontsize=LABEL)
+    bar.ax.tick_params(labelsize=9.5)
     if codes is not None:
         chosen = np.asarray(codes(_at_rest(task, np.stack(cells))))
         for centre, code in zip(cells, chosen, strict=True):
-            if directions is not None:
-                step = (
-                    directions[code]
-                    / max(float(np.linalg.norm(directions[code])), 1e-6)
-                    * 0.42
-                    * task.cell_size
-                )
-                ax.annotate(
-                    "",
-                    tuple(centre + step),
-                    tuple(centre),
-                    arrowprops={"arrowstyle": "->", "color": "white", "lw": 1.2},
-                    zorder=3,
-                )
-            _number(ax, centre, int(code), size=5)
-    ax.set_xlim(draw_limits[0])
-    ax.set_ylim(draw_limits[1])
-    ax.set_title(
-        "Value at rest; the code chosen at each cell's centre and where that code leads on average",
-        fontsize=8,
-    )
+            if directions is not None and (length := float(np.linalg.norm(directions[code]))) > 1e-6:
+                tip = centre + directions[code] / length * 0.48 * task.cell_size
+                outline = [withStroke(linewidth=3.2, foreground="black")]  # seen on dark and on light values
+                line = {"color": "white", "lw": 1.5, "path_effects": outline}
+                arrow = {"arrowstyle": "->", "shrinkA": 0, "shrinkB": 0, **line}
+                ax.annotate("", tuple(tip), tuple(centre), arrowprops=arrow, zorder=5.5)
+            draw_number(ax, centre, int(code), size=8)
+    ax.set(xlim=limits[0], ylim=limits[1])
+    ax.set_title("Value of a body at rest; likeliest skill and where it leads on average", fontsize=LABEL)
     return figure
 
 

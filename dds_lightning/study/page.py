@@ -64,7 +64,7 @@ def _opening(found: Findings) -> str:
 
 
 def _results(found: Findings) -> str:
-    notes = "Intervals are Wilson's. All contestants played from the same starts."
+    notes = "Intervals are Wilson's, ± is the standard error. All contestants played from the same starts."
     if (found.summary["kind"] == BEST).any():
         each = int(found.summary.loc[found.summary["kind"] == SKILL, "episodes"].iloc[0])
         notes += f" The best single skill was picked afterwards, from {each} episodes each, which flatters it."
@@ -82,8 +82,10 @@ def _skills(found: Findings, files: Mapping[str, str]) -> str:
     table = found.skills
     shown = markdown(table.rename(columns=headings), {headings.get(k, k): v for k, v in formats.items()})
     text = "## The skills\n\n"
+    if "starts_by_skill" in files:
+        text += _picture(files, "starts_by_skill", "Each skill alone from several starts, one panel a skill.") + "\n\n"
     if "skills_by_start" in files:
-        text += _picture(files, "skills_by_start", "Every skill alone from several starts.") + "\n\n"
+        text += _picture(files, "skills_by_start", "The same from near; a number is where its skill ended.") + "\n\n"
     if "single_skills" in files:
         text += _picture(files, "single_skills", "Each skill alone from the task's own start.") + "\n\n"
     text += shown + f"\n\nChosen: share of the decisions of {found.main}."
@@ -97,7 +99,8 @@ def _failures(found: Findings, files: Mapping[str, str]) -> str:
     text = "## Where failed episodes ended\n\n"
     text += markdown(ends(found.failures[mine])) if mine.any() else f"No episode of {found.main} failed."
     if "failed_ends" in files:
-        text += "\n\n" + _picture(files, "failed_ends", "Numbers are the skill in use at the end.")
+        caption = "A dot is an end, the number on it the skill in use; bold numbers count the ends in a cell."
+        text += "\n\n" + _picture(files, "failed_ends", caption)
     others = found.failures[~mine].groupby("contestant", sort=False).head(_OTHERS)
     if len(others):
         table = ends(others)

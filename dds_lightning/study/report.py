@@ -137,6 +137,7 @@ def write_report(run_dir: str | Path) -> dict[str, Any]:
         "table": found.summary.round(4),
         "failures": failures.round(4).astype(object).where(failures.notna(), None),
     }
+    made["failures_table"] = made.pop("failures")  # the name belongs to the facts
     return {"report": text, **made, **plain(facts)}
 
 
@@ -204,6 +205,7 @@ def _draw_maze(found: Findings, folder: Path, keep: Any, made: dict[str, Path]) 
     agent = found.root / "agent"
     if (agent / "SHA256SUMS").is_file():
         replays = stored_replays(folder / "replays.npz", task, agent)
+        keep("starts_by_skill", maze.plot_starts_by_skill(task, **replays))
         keep("skills_by_start", maze.plot_skills_by_start(task, **replays))
         keep("values", _value_map(found, agent))
 

@@ -160,7 +160,7 @@ def skills_table(
 
 
 def readable(summary: pd.DataFrame) -> pd.DataFrame:
-    """The summary as it is printed: units in the headings, one text for a rate with its interval."""
+    """The summary as it is printed: units in the headings, a mean with its standard error, a rate with its interval."""
     skill = summary["kind"] == SKILL
     columns = {
         "contestant": summary["contestant"].where(~skill, "  " + summary["contestant"]),
@@ -170,7 +170,10 @@ def readable(summary: pd.DataFrame) -> pd.DataFrame:
             f"{low:.1f} to {high:.1f}"
             for low, high in zip(summary["success_low"], summary["success_high"], strict=True)
         ],
-        "score": [cell(value, ".1f") for value in summary["score"]],
+        "score": [
+            cell(mean, ".1f") + ("" if pd.isna(error) else f" ± {error:.1f}")
+            for mean, error in zip(summary["score"], summary["score_error"], strict=True)
+        ],
         "steps (median, successes)": [cell(value, ".0f") for value in summary["length"]],
     }
     return pd.DataFrame(columns)

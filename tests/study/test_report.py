@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -123,7 +124,8 @@ def test_the_report_twice_is_the_same_to_the_byte_and_names_every_path(run, made
 
 def test_every_file_of_a_maze_report_is_there_and_linked(run, made):
     text = made["report"].read_text()
-    pictures = {"trajectories", "clip", "single_skills", "failed_ends", "skills_by_start", "values", "training"}
+    maze = {"trajectories", "clip", "failed_ends", "values"}
+    pictures = maze | {"single_skills", "starts_by_skill", "skills_by_start", "training"}
     assert pictures <= made.keys()
     for name in pictures:
         assert made[name].stat().st_size > 1000
@@ -133,6 +135,11 @@ def test_every_file_of_a_maze_report_is_there_and_linked(run, made):
     assert "seed 3" in text
     assert "1 min 5 s" in text
     assert str(run) not in text
+    assert {path.name for path in made.values() if isinstance(path, Path)} >= {
+        "summary.csv",
+        "failures.csv",
+        "skills.csv",
+    }
 
 
 def test_facts_are_plain_json_and_say_where_the_main_contestant_failed(made):

@@ -157,7 +157,7 @@ def test_skills_table_without_data_or_replays():
 
 def test_printed_table_and_its_markdown():
     shown = readable(summary_table(episodes()))
-    assert shown.iloc[0].tolist() == ["policy", 4, "75.0", "30.1 to 95.4", "75.0", "340"]
+    assert shown.iloc[0].tolist() == ["policy", 4, "75.0", "30.1 to 95.4", "75.0 ± 25.0", "340"]
     assert shown.iloc[5]["steps (median, successes)"] == "-"
     text = markdown(pd.DataFrame({"a|b": ["x|y"], "n": [1.25]}), {"n": ".1f"})
     assert text == "| a|b | n |\n| --- | --: |\n| x\\|y | 1.2 |"
