@@ -4,7 +4,8 @@ TASK   ?= pointmaze-large-diverse
 SEED   ?= 0
 VENV   ?= .venv
 BIN    := $(VENV)/bin
-PYTEST_ARGS ?= -n auto
+# One worker plays a whole file, so that the data and models its tests share are made once.
+PYTEST_ARGS ?= -n auto --dist loadscope
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test lint format notebooks-env clean

@@ -24,9 +24,17 @@ from dds_lightning.envpool import EnvPool
 from dds_lightning.errors import UserError
 from dds_lightning.results import RolloutPath as RolloutPath
 from dds_lightning.results import RolloutResult as RolloutResult
-from dds_lightning.seating import DEFAULT_SLOTS, Plan, Seat, bundle, check_contestants, plan_slots, take_seats
+from dds_lightning.seating import (
+    DEFAULT_SLOTS,
+    Plan,
+    Seat,
+    bundle,
+    check_contestants,
+    episode_seeds,
+    plan_slots,
+    take_seats,
+)
 from dds_lightning.seating import episode_seed as episode_seed
-from dds_lightning.seating import episode_seeds
 from dds_lightning.seating import slots_needed as slots_needed
 from dds_lightning.tasks import Task, get_task
 

@@ -116,12 +116,13 @@ def test_the_printed_command_makes_the_same_checkpoint(finished, capsys, tmp_pat
 
 def test_only_what_a_changed_setting_touches_is_done_again(finished, capsys, tmp_path):
     out = tmp_path / "run"
-    call(capsys, "--out", out, *SMALL, "--until=policy")
-    _, said, err = call(capsys, "--out", out, *SMALL, "--until=policy", "--policy.model.alpha=7")
+    given = [*SMALL, f"--data=local:{finished / 'data' / TASK}"]
+    call(capsys, "--out", out, *given, "--until=policy")
+    _, said, err = call(capsys, "--out", out, *given, "--until=policy", "--policy.model.alpha=7")
     assert said["done_before"] == ["data", "skill", "relabel"]
     assert "model.alpha" in err
     assert (out / "previous" / "policy" / "last.ckpt").is_file()
-    _, said, _ = call(capsys, "--out", out, *SMALL, "--until=relabel", "--policy.data.gamma=0.9")
+    _, said, _ = call(capsys, "--out", out, *given, "--until=relabel", "--policy.data.gamma=0.9")
     assert said["done_before"] == ["data", "skill"]
 
 
@@ -130,13 +131,14 @@ def test_an_interrupted_run_goes_on_and_ends_with_the_same_bits(finished, capsys
     checkpoint = out / "skill" / "last.ckpt"
     sender = threading.Thread(target=_signal_when, args=(checkpoint, signal.SIGINT))
     sender.start()
-    long = ["--skill.trainer.max_steps=150", "--skill.checkpoint.every_n_steps=3", "--until=skill"]
+    long = [f"--data=local:{finished / 'data' / TASK}"]
+    long += ["--skill.trainer.max_steps=100", "--skill.checkpoint.every_n_steps=3", "--until=skill"]
     status, _, err = call(capsys, "--out", out, *SMALL, *long)
     sender.join()
     assert status == 130
     assert "the same command goes on" in err
     stopped = torch.load(checkpoint, weights_only=True)["global_step"]
-    assert 3 <= stopped < 150
+    assert 3 <= stopped < 100
     status, said, err = call(capsys, "--out", out, *SMALL, *long)
     assert status == 0, err
     assert said["done_before"] == ["data"]

@@ -253,7 +253,7 @@ def plot_failures(task: Task, result: RolloutResult, actor: str) -> Figure:
     cells, counts = np.unique(task.xy_to_cell(ends), axis=0, return_counts=True)
     for cell, count in zip(cells, counts, strict=True):
         x, y = task.cell_to_xy(cell)
-        style = {"fontsize": LABEL, "fontweight": "bold", "ha": "center", "va": "center"}
+        style: dict[str, Any] = {"fontsize": LABEL, "fontweight": "bold", "ha": "center", "va": "center"}
         text = ax.text(x, y, f"{count}×", zorder=8, **style)  # above the ends: half hidden, 16 would read as 6
         text.set_path_effects([withStroke(linewidth=3.0, foreground="white")])
     if len(failed):
