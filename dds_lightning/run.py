@@ -16,11 +16,11 @@ from typing import Any
 
 from rich.console import Console
 
-from dds_lightning import contestants
 from dds_lightning.configs import find_preset
 from dds_lightning.errors import UserError
 from dds_lightning.reports import Report
 from dds_lightning.stages import Done, Stages, duration, locked
+from dds_lightning.study import contestants
 from dds_lightning.tasks import Task, get_task
 
 STAGES = ("data", "skill", "relabel", "policy", "clone", "evaluate", "report")
@@ -63,7 +63,7 @@ class Run:
 
     def __init__(self, settings: RunSettings) -> None:
         """Check everything that can be checked before the first file."""
-        from dds_lightning.fitting import quieten, settings_of
+        from dds_lightning.training.fitting import quieten, settings_of
 
         quieten()
         self.wanted = settings
@@ -189,7 +189,7 @@ class Run:
 
     def _fit(self, stage: str, folder: Path, resuming: bool) -> dict[str, Any]:
         """Run `dds STAGE fit`, from its last checkpoint if there is one."""
-        from dds_lightning.fitting import StageCLI, command_line
+        from dds_lightning.training.fitting import StageCLI, command_line
 
         words = self._words(stage, self.spec)
         if resuming and (folder / "last.ckpt").is_file():

@@ -5,8 +5,8 @@ import yaml
 
 from dds_lightning.configs import ROOT, find, find_preset, packaged, resolve_configs
 from dds_lightning.errors import UserError
-from dds_lightning.fitting import settings_of
 from dds_lightning.tasks import get_task, task_names
+from dds_lightning.training.fitting import settings_of
 
 
 def _flat(value, prefix=""):

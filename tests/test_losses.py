@@ -18,9 +18,7 @@ def test_vector_quantisation_sums_over_dimensions_and_averages_over_the_batch():
     # sg[.]: the codebook term moves only the vectors, the commitment term only the encoder.
     (grad_vectors, grad_encodings) = torch.autograd.grad(codebook, [vectors, encodings], allow_unused=True)
     assert grad_encodings is None
-    torch.testing.assert_close(
-        grad_vectors, vectors.detach() - encodings.detach()
-    )  # 2 (z - E) / B with B = 2
+    torch.testing.assert_close(grad_vectors, vectors.detach() - encodings.detach())  # 2 (z - E) / B with B = 2
     (grad_vectors, grad_encodings) = torch.autograd.grad(commitment, [vectors, encodings], allow_unused=True)
     assert grad_vectors is None
     torch.testing.assert_close(grad_encodings, encodings.detach() - vectors.detach())
@@ -51,9 +49,7 @@ def test_the_minimum_of_the_expectile_loss_is_the_expectile():
 
 
 def test_td_target_bootstraps_unless_the_transition_ended():
-    target = losses.td_target(
-        tensor([1.0, 1.0]), tensor([0.9, 0.9]), tensor([0.0, 1.0]), tensor([10.0, 10.0])
-    )
+    target = losses.td_target(tensor([1.0, 1.0]), tensor([0.9, 0.9]), tensor([0.0, 1.0]), tensor([10.0, 10.0]))
     assert target.tolist() == pytest.approx([10.0, 1.0])
 
 

@@ -213,9 +213,7 @@ def test_the_watch_warns_of_values_that_no_rewards_can_sum_to():
     with pytest.warns(UserWarning, match="allow only 0 to 10: the critic diverges"):
         module._watch({"v_min": torch.tensor(0.0), "v_max": torch.tensor(25.0)})
     with pytest.warns(UserWarning, match="80 % of the AWR weights are clipped"):
-        module._watch(
-            {"v_min": torch.tensor(0.0), "v_max": torch.tensor(1.0), "clipped_share": torch.tensor(0.8)}
-        )
+        module._watch({"v_min": torch.tensor(0.0), "v_max": torch.tensor(1.0), "clipped_share": torch.tensor(0.8)})
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 
 from dds_lightning.cli import main
 from dds_lightning.cli.parser import build_parser, prepare
-from dds_lightning.fitting import settings_of
+from dds_lightning.training.fitting import settings_of
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()

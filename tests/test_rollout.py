@@ -339,3 +339,47 @@ def test_closing_twice_and_bad_sizes():
         EnvPool(UMAZE, 0)
     with pytest.raises(UserError, match="workers is -1"):
         EnvPool(UMAZE, 1, workers=-1)
+
+
+def test_an_interrupt_while_acting_ends_the_workers(monkeypatch):
+    pids = []
+
+    class Interrupted(RandomActor):
+        def act(self, observations, restarted, rows):
+            raise KeyboardInterrupt
+
+    import dds_lightning.rollout as module
+
+    class Pool(module.EnvPool):
+        def __init__(self, *arguments):
+            super().__init__(*arguments)
+            pids.extend(part.process.pid for part in self._parts)
+
+    monkeypatch.setattr(module, "EnvPool", Pool)
+    with pytest.raises(KeyboardInterrupt):
+        rollout(UMAZE, [Contestant("i", Interrupted(2), 8)], workers=2)
+    assert len(pids) == 2
+    assert _children_gone(pids)
+
+
+@pytest.mark.parametrize(("terminal", "wanted"), [(True, True), (True, False), (False, True)])
+def test_progress_shows_on_a_terminal_only_and_never_on_standard_output(monkeypatch, capsys, terminal, wanted):
+    monkeypatch.setattr("rich.console.Console.is_terminal", property(lambda self: terminal))
+    rollout(TOY, [Contestant("a", Constant(2.0), 4)], workers=0, progress=wanted)
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert ("success 100 %" in captured.err) == (terminal and wanted)
+
+
+def test_torch_threads_are_put_back():
+    import torch
+
+    class Counter(Constant):
+        def act(self, observations, restarted, rows):
+            seen.append(torch.get_num_threads())
+            return super().act(observations, restarted, rows)
+
+    seen, before = [], torch.get_num_threads()
+    rollout(TOY, [Contestant("a", Counter(2.0), 1)], workers=0, threads=2)
+    assert seen == [2]
+    assert torch.get_num_threads() == before

@@ -15,8 +15,8 @@ import torch
 
 from dds_lightning import DDSAgent
 from dds_lightning.cli import main
-from dds_lightning.contestants import EveryRow, final_table, way_name
 from dds_lightning.errors import UserError
+from dds_lightning.study.contestants import EveryRow, final_table, way_name
 from dds_lightning.tasks import get_task
 
 TASK = "pointmaze-umaze-diverse"

@@ -149,9 +149,7 @@ def test_validation_logs_reconstruction_and_codebook_health(trained):
 
 
 def test_a_restarted_code_forgets_its_moments():
-    module = small(
-        lr=1e-3, restart_every=1, restart_threshold=0.5, restart_until=1.0, codebook_init="uniform"
-    )
+    module = small(lr=1e-3, restart_every=1, restart_threshold=0.5, restart_until=1.0, codebook_init="uniform")
 
     class Kill(pl.Callback):
         def on_train_batch_start(self, trainer, pl_module, *_):

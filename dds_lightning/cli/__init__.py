@@ -14,7 +14,7 @@ from typing import Any
 
 from dds_lightning import __version__
 from dds_lightning.errors import UserError
-from dds_lightning.interrupts import Interrupted, caught
+from dds_lightning.training.interrupts import Interrupted, caught
 
 USAGE_ERROR = 2
 STAGES = {
@@ -52,7 +52,7 @@ def _dispatch(words: list[str]) -> int:
         return 0
     try:
         if words and words[0] in STAGES:
-            from dds_lightning.fitting import command
+            from dds_lightning.training.fitting import command
 
             as_json, work = "--json" in words, command(words[0], words[1:])
         else:

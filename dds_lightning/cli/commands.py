@@ -151,8 +151,8 @@ def evaluate(
     """
     from dds_lightning.agent import DDSAgent
     from dds_lightning.checkpointing import load_published
-    from dds_lightning.contestants import agent_directory, way
     from dds_lightning.rollout import rollout
+    from dds_lightning.study.contestants import agent_directory, way
     from dds_lightning.tasks import get_task
 
     path = agent_directory(Path(directory))

@@ -183,9 +183,7 @@ class DiffusionDecoder(nn.Module):
                 x = previous.sqrt() * x0 + (1.0 - previous).sqrt() * noise
                 continue
             beta = self.betas[i]
-            mean = (previous.sqrt() * beta * x0 + (1.0 - beta).sqrt() * (1.0 - previous) * x) / (
-                1.0 - alpha_bar
-            )
+            mean = (previous.sqrt() * beta * x0 + (1.0 - beta).sqrt() * (1.0 - previous) * x) / (1.0 - alpha_bar)
             variance = beta * (1.0 - previous) / (1.0 - alpha_bar)
             x = mean + variance.sqrt() * draw()
         raise AssertionError("unreachable: the loop returns at i = 0")

@@ -180,9 +180,9 @@ def fit_clone(
         UserError: data that do not fit, or a setting outside its range.
     """
     from datamodules.segments import SegmentDataModule
-    from dds_lightning import interrupts
-    from dds_lightning.fitting import quieten
-    from dds_lightning.training import RollingCheckpoint, trainer_settings
+    from dds_lightning.training import interrupts
+    from dds_lightning.training.fitting import quieten
+    from dds_lightning.training.trainer import RollingCheckpoint, trainer_settings
 
     quieten()
     if steps < 1:

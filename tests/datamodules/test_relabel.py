@@ -56,9 +56,7 @@ def test_every_end_of_an_episode(trajectories, skill):
 
 def test_discount_per_step_counts_the_steps_really_taken(trajectories, skill):
     made = relabel(trajectories, skill, gamma=0.5, discount="per_step")
-    assert made.discounts.tolist() == pytest.approx(
-        [0.125, 0.125, 0.125, 0.25, 0.5, 0.125, 0.125, 0.125, 0.25, 0.5]
-    )
+    assert made.discounts.tolist() == pytest.approx([0.125, 0.125, 0.125, 0.25, 0.5, 0.125, 0.125, 0.125, 0.25, 0.5])
 
 
 def test_the_learning_reward_is_shifted_then_scaled(trajectories, skill):

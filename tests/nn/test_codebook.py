@@ -61,9 +61,7 @@ def test_ema_moves_each_vector_to_the_mean_of_its_members():
 
 def test_dead_codes_restart_on_points_that_are_badly_served():
     codebook = Codebook(4, 2, init="uniform").train()
-    codebook.set_vectors(
-        torch.arange(4), torch.tensor([[0.0, 0.0], [50.0, 50.0], [-50.0, 50.0], [50.0, -50.0]])
-    )
+    codebook.set_vectors(torch.arange(4), torch.tensor([[0.0, 0.0], [50.0, 50.0], [-50.0, 50.0], [50.0, -50.0]]))
     points = torch.cat([torch.randn(200, 2) * 0.1, torch.randn(200, 2) * 0.1 + 5.0])
     for _ in range(200):
         codebook(points)

@@ -9,9 +9,7 @@ from dds_lightning.nn.diffusion import DiffusionDecoder, MLPDecoder, sinusoidal_
 def test_vp_schedule_of_the_paper():
     betas = vp_betas(5, 0.1, 10.0)
     assert betas.tolist() == pytest.approx([0.196, 0.459, 0.636, 0.755, 0.835], abs=6e-4)
-    assert torch.cumprod(1 - betas, 0).tolist() == pytest.approx(
-        [0.804, 0.435, 0.159, 0.039, 0.0064], abs=6e-4
-    )
+    assert torch.cumprod(1 - betas, 0).tolist() == pytest.approx([0.804, 0.435, 0.159, 0.039, 0.0064], abs=6e-4)
 
 
 def test_time_embedding_starts_with_sines_and_ends_with_cosines():

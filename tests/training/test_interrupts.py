@@ -4,7 +4,7 @@ import signal
 
 import pytest
 
-from dds_lightning.interrupts import Interrupted, caught, deferred, pending
+from dds_lightning.training.interrupts import Interrupted, caught, deferred, pending
 
 
 @pytest.mark.parametrize(("signum", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

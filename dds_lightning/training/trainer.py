@@ -13,11 +13,11 @@ import lightning.pytorch as pl
 from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, ProgressBar
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
-from dds_lightning import interrupts
 from dds_lightning.callbacks import ExactResume, FiniteGuard
 from dds_lightning.checkpointing import AtomicCheckpointIO
 from dds_lightning.errors import UserError
-from dds_lightning.progress import StepProgress
+from dds_lightning.training import interrupts
+from dds_lightning.training.progress import StepProgress
 
 
 class RollingCheckpoint(Checkpoint):

@@ -20,12 +20,12 @@ from jsonargparse import ArgumentError, Namespace
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
-from dds_lightning import interrupts
 from dds_lightning.checkpointing import load_ckpt
 from dds_lightning.configs import resolve_configs
 from dds_lightning.errors import UserError
 from dds_lightning.reports import Report, table
-from dds_lightning.training import BestCheckpoint, RollingCheckpoint, trainer_settings
+from dds_lightning.training import interrupts
+from dds_lightning.training.trainer import BestCheckpoint, RollingCheckpoint, trainer_settings
 
 DESCRIPTION = {
     "skill": "Stage one: learn discrete skills from segments of trajectories.",
