@@ -124,6 +124,7 @@ class Relabelled:
         }
         with written_whole(Path(path)) as part:
             save_file({name: getattr(self, name).contiguous().cpu() for name in _STORED}, part, metadata=metadata)
+            part.chmod(0o644)  # safetensors writes for the owner alone
 
     @classmethod
     def load(cls, path: str | Path, key: dict[str, str | int | float] | None = None) -> "Relabelled":

@@ -20,7 +20,6 @@ import pickle
 import subprocess
 import sys
 import weakref
-from collections import deque
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Self
 
@@ -45,16 +44,16 @@ class _Local:
 
     def __init__(self, task: Task, count: int) -> None:
         self.slots = Slots(task, count)
-        self.answers: deque[NDArray[Any]] = deque()
+        self.answer: NDArray[Any] = np.zeros(0)
 
     def send_start(self, seeds: list[list[int]]) -> None:
-        self.answers.append(self.slots.start(seeds))
+        self.answer = self.slots.start(seeds)
 
     def send_step(self, slots: NDArray[np.int64], actions: NDArray[np.float32]) -> None:
-        self.answers.append(self.slots.step(slots, actions))
+        self.answer = self.slots.step(slots, actions)
 
     def receive(self) -> NDArray[Any]:
-        return self.answers.popleft()
+        return self.answer
 
     def close(self) -> None:
         self.slots.close()
@@ -120,9 +119,6 @@ class EnvPool:
     Workers take about a second to start, so keep the pool where rollouts repeat. Results do not depend on the
     number of workers.
 
-    `step` waits for the environments. To act on some slots while others are stepped, `send` several requests
-    for different slots and `receive` their answers in the same order.
-
     Args:
         task: what to build; must be picklable when there are workers.
         num_envs: slots E.
@@ -141,20 +137,18 @@ class EnvPool:
         workers = min(available_cores(), -(-num_envs // 4)) if workers is None else workers
         if workers < 0:
             raise UserError(f"workers is {workers}, expected 0 (no processes) or more")
-        workers = min(workers, -(-num_envs // 2))
+        workers = min(workers, num_envs)
         self.task, self.num_envs, self.workers = task, num_envs, workers
-        # Neighbouring slots play alike contestants, so deal them out: in pairs, as rollouts send every second.
-        slots, parts = np.arange(num_envs), max(workers, 1)
-        self._owner = slots // 2 % parts
-        self._place = slots // (2 * parts) * 2 + slots % 2  # within the owner
+        # Neighbouring slots play alike contestants, so deal them out: part p has slots p, p + parts, ...
+        parts = max(workers, 1)
+        self._slots = [np.arange(part, num_envs, parts) for part in range(parts)]
         self._parts: list[_Local | _Remote] = []
-        self._sent: deque[NDArray[np.intp]] = deque()
         self._alive = np.zeros(num_envs, dtype=bool)
         self._broken = True
         try:
             for part in range(parts):
                 name = f"environment worker {part} of {workers} ({task.name})"
-                count = int(np.sum(self._owner == part))
+                count = len(self._slots[part])
                 self._parts.append(_Remote(task, count, name) if workers else _Local(task, count))
             for own in self._parts:
                 if isinstance(own, _Remote):
@@ -180,54 +174,40 @@ class EnvPool:
         """
         if len(seeds) > self.num_envs:
             raise UserError(f"{len(seeds)} slots wanted, but the pool has {self.num_envs} environments")
-        while self._sent:
-            self.receive()
         plan = [list(map(int, own)) for own in seeds] + [[] for _ in range(self.num_envs - len(seeds))]
-        slots = [np.flatnonzero(self._owner == part) for part in range(len(self._parts))]
         records = np.zeros(self.num_envs, record_dtype(self.task))
         with self._exchange():
-            for part, own in zip(self._parts, slots, strict=True):
+            for part, own in zip(self._parts, self._slots, strict=True):
                 part.send_start([plan[slot] for slot in own])
-            for part, own in zip(self._parts, slots, strict=True):
+            for part, own in zip(self._parts, self._slots, strict=True):
                 records[own] = part.receive()
         self._alive = records["alive"].copy()
         return records
 
-    def send(self, slots: NDArray[np.intp], actions: NDArray[np.float32]) -> None:
-        """Ask for one step of some live slots that no other request in progress holds.
+    def step(self, actions: NDArray[np.float32]) -> NDArray[Any]:
+        """Step every live slot once.
 
         Args:
-            slots: (n,) ascending.
-            actions: (n, A), a row each.
+            actions: (n, A), a row for each slot of `alive`, in that order.
+
+        Returns:
+            (n,) records of the same slots, see `record_dtype`.
         """
+        slots = self.alive
         actions = np.ascontiguousarray(actions, dtype=np.float32)
         if actions.shape != (len(slots), self.task.action_dim):
             raise ValueError(f"actions are {actions.shape}, expected {(len(slots), self.task.action_dim)}")
-        owner = self._owner[slots]
-        with self._exchange():
-            for number, part in enumerate(self._parts):
-                rows = owner == number
-                if rows.any():
-                    part.send_step(self._place[slots[rows]], actions[rows])
-        self._sent.append(slots)
-
-    def receive(self) -> tuple[NDArray[np.intp], NDArray[Any]]:
-        """Wait for the oldest request: its slots (n,) and their records (n,), see `record_dtype`."""
-        slots = self._sent.popleft()
         records = np.zeros(len(slots), record_dtype(self.task))
-        owner = self._owner[slots]
+        owner = slots % len(self._slots)
+        rows = [np.flatnonzero(owner == number) for number in range(len(self._slots))]
         with self._exchange():
-            for number, part in enumerate(self._parts):
-                rows = owner == number
-                if rows.any():
-                    records[rows] = part.receive()
+            busy = [(part, own) for part, own in zip(self._parts, rows, strict=True) if len(own)]
+            for part, own in busy:
+                part.send_step(slots[own] // len(self._slots), actions[own])
+            for part, own in busy:
+                records[own] = part.receive()
         self._alive[slots] = records["alive"]
-        return slots, records
-
-    def step(self, actions: NDArray[np.float32]) -> NDArray[Any]:
-        """Step every live slot once: actions (n, A) in the order of `alive`, to records (n,)."""
-        self.send(self.alive, actions)
-        return self.receive()[1]
+        return records
 
     @contextlib.contextmanager
     def _exchange(self) -> Any:
@@ -241,11 +221,6 @@ class EnvPool:
             raise
 
     @property
-    def busy(self) -> bool:
-        """Whether there is a request to `receive`."""
-        return bool(self._sent)
-
-    @property
     def closed(self) -> bool:
         """Whether the pool can no longer be used."""
         return self._broken
@@ -254,7 +229,6 @@ class EnvPool:
         """End the workers and close the environments; harmless when repeated."""
         self._broken = True
         self._alive[:] = False
-        self._sent.clear()
         parts, self._parts = self._parts, []
         for part in parts:
             if isinstance(part, _Remote) and part.process.stdin is not None:

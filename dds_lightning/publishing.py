@@ -116,6 +116,7 @@ def publish(
     part.mkdir()
     try:
         safetensors.torch.save_file(state, part / WEIGHTS, metadata={"format": "pt"})
+        (part / WEIGHTS).chmod(0o644)  # safetensors writes for the owner alone
         for name, text in texts.items():
             (part / name).write_text(text, encoding="utf-8")
         sums = "".join(f"{sha256(part / name)}  {name}\n" for name in CONTENTS)

@@ -38,9 +38,6 @@ from dds_lightning.seating import episode_seed as episode_seed
 from dds_lightning.seating import slots_needed as slots_needed
 from dds_lightning.tasks import Task, get_task
 
-OVERLAP = range(24, 4096)
-"""Slots with which acting and stepping overlap: half a batch must be worth acting for."""
-
 
 def rollout(
     task: Task | str,
@@ -68,9 +65,9 @@ def rollout(
         record_observations: keep the observations as well.
         pool: play in these environments instead of new ones; `workers` is then not used, and `slots` is
             bounded by its size.
-        threads: torch's threads while acting. Workers step at the same time, and threads that wait for a core
-            cost more than they bring; with large networks and many cores give more. The last bits of the
-            table may depend on it.
+        threads: torch's threads while acting. One is best for small networks and on a busy machine, where
+            threads that wait for a core cost far more than they bring; large networks on idle cores gain from
+            more. The last bits of the table may depend on it.
 
     Returns:
         The table of episodes, in the contestants' order, and the recorded paths.
@@ -140,17 +137,9 @@ class _Match:
         self.observations, self.restarted = start["observation"].copy(), start["alive"].copy()
         alive = pool.alive
         self._remember(alive, start["position"][alive], start["observation"][alive])
-        # Two halves take turns: while the workers step one, the actors act for the other.
-        halves = [alive[alive % 2 == half] for half in (0, 1)] if len(alive) in OVERLAP else [alive]
-        for half in halves:
-            pool.send(half, self._act(seats, half))
         rows: list[dict[str, Any]] = []
-        while pool.busy:
-            slots, records = pool.receive()
-            rows += self._note(slots, records)
-            more = slots[records["alive"]]
-            if len(more):
-                pool.send(more, self._act(seats, more))
+        while len(alive := pool.alive):
+            rows += self._note(alive, pool.step(self._act(seats, alive)))
         return rows
 
     def _note(self, slots: NDArray[np.intp], records: NDArray[Any]) -> list[dict[str, Any]]:

@@ -10,6 +10,7 @@ The two trainings are the very commands `dds skill fit` and `dds policy fit`, wh
 
 import hashlib
 import json
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -107,6 +108,7 @@ class Run:
         title = f"data: {w.data_steps:,} steps of {self.task.name}" if w.data is None else f"data: {w.data}"
         data = stages.do("data", title, origin, [], self._data)
         self.spec = w.data or f"local:{data.outputs['data']}"
+        self.data_facts = data.facts["facts"]
         if last < 1:
             return
         model = self.settings["skill"]["model"]
@@ -267,9 +269,27 @@ class Run:
         published = agent.save(
             self.out / "agent",
             metrics={"episodes": self.episodes, "seed": w.seed, "results": _records(summary)},
+            card=self._card(result.episodes),
             task=self.task.name,
         )
         return {"episodes": folder / "episodes.parquet", "agent": published, "results": _records(summary)}
+
+    def _card(self, episodes: Any) -> str:
+        """The README.md of the published agent."""
+        from dds_lightning.study.card import agent_card
+
+        w = self.wanted
+        made = f"collected by `dds data collect {self.task.name} --steps {w.data_steps} --seed {w.seed}`"
+        words = ["dds", "run", self.task.name, f"--seed={w.seed}", *(["--data", w.data] if w.data else [])]
+        words += [f"--{stage}.{word.removeprefix('--')}" for stage in ("skill", "policy") for word in getattr(w, stage)]
+        return agent_card(
+            self.task,
+            episodes,
+            seed=w.seed,
+            data={"source": w.data or made, **self.data_facts},
+            settings=self.settings,
+            command=shlex.join(words),
+        )
 
     def _write_report(self, folder: Path, resuming: bool) -> dict[str, Any]:
         """Draw what a person looks at."""

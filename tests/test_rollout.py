@@ -74,9 +74,7 @@ class Coder(Constant):
 
 
 @pytest.mark.parametrize("slots", [1, 2, 7, 64])
-@pytest.mark.parametrize("overlap", [True, False])
-def test_every_episode_is_played_once_whatever_the_slots(monkeypatch, slots, overlap):
-    monkeypatch.setattr("dds_lightning.rollout.OVERLAP", range(2, 99) if overlap else ())
+def test_every_episode_is_played_once_whatever_the_slots(slots):
     result = rollout(
         TOY, [Contestant("a", Constant(0.5), 11), Contestant("b", Constant(2.0), 6)], workers=0, slots=slots
     )

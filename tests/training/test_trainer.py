@@ -11,10 +11,10 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from torch import nn
 
-from dds_lightning.training import trainer as training
 from dds_lightning.callbacks import ExactResume, FiniteGuard
 from dds_lightning.checkpointing import AtomicCheckpointIO
 from dds_lightning.errors import UserError
+from dds_lightning.training import trainer as training
 from dds_lightning.training.progress import StepProgress
 from dds_lightning.training.trainer import BestCheckpoint, RollingCheckpoint, trainer_settings
 
