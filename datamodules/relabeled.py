@@ -3,6 +3,7 @@
 import hashlib
 import json
 import logging
+import os
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,8 @@ class RelabeledDataModule(pl.LightningDataModule):
         data: where the data are, e.g. ``local:DIR`` or ``minari:ID``.
         skill: skill checkpoint: a Lightning ``.ckpt`` or a published directory.
         relabelled: read this file (of ``dds relabel``) instead of the cache; refused if made from anything else.
-        cache: folder of the cache; null puts it beside the skill checkpoint.
+        cache: folder of the cache; null puts it beside the skill checkpoint, or in the user's cache folder where that
+            is a published directory.
         gamma: discount a step.
         discount: ``per_skill`` bootstraps with gamma (the paper), ``per_step`` with gamma^h.
         stride: steps between the starts of two segments.
@@ -113,9 +115,16 @@ class RelabeledDataModule(pl.LightningDataModule):
         """Where the relabelled data of exactly these inputs lie."""
         key = relabel_key(self.trajectories, self.skill, **self.settings)
         name = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:16]
+        return self._cache_folder() / f"relabelled-{name}.safetensors"
+
+    def _cache_folder(self) -> Path:
+        """The folder asked for, else beside a training's checkpoint; nothing is added to a published directory."""
+        if self.hparams.cache:
+            return Path(self.hparams.cache)
         skill = Path(self.hparams.skill)
-        folder = Path(self.hparams.cache) if self.hparams.cache else (skill if skill.is_dir() else skill.parent)
-        return folder / f"relabelled-{name}.safetensors"
+        if not skill.is_dir():
+            return skill.parent
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dds-lightning"
 
     def prepare_data(self) -> None:
         """Relabel, unless the result of exactly these inputs is on disk."""

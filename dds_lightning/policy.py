@@ -282,7 +282,8 @@ class PolicyModule(pl.LightningModule):
         """One optimiser step's loss."""
         total, self.terms = self.loss(batch)
         if is_log_step(self):
-            self.log_dict({f"train/{name}": value for name, value in self.terms.items()})
+            log = {"loss": total.detach(), **self.terms}
+            self.log_dict({f"train/{name}": value for name, value in log.items()})
         if self.global_step % self.hparams.watch == 0:
             self._watch(self.terms)
         return total

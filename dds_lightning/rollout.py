@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from dds_lightning.actors import Contestant
 from dds_lightning.actors import single_skills as single_skills
-from dds_lightning.envpool import EnvPool
+from dds_lightning.envs.pool import EnvPool
 from dds_lightning.errors import UserError
 from dds_lightning.results import RolloutPath as RolloutPath
 from dds_lightning.results import RolloutResult as RolloutResult

@@ -153,7 +153,7 @@ class Task:
             render_mode: Gymnasium's render mode, for example "rgb_array".
         """
         options = {"continuing_task": False} if self.maze_map is not None else {}
-        from dds_lightning.environments import TaskEnv, build_env
+        from dds_lightning.envs.build import TaskEnv, build_env
 
         cap = self.max_episode_steps
         env = build_env(self.env_id, max_episode_steps=cap, render_mode=render_mode, **options)

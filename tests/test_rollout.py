@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 from dds_lightning.actors import RandomActor
-from dds_lightning.envpool import EnvPool, EnvPoolError
+from dds_lightning.envs.pool import EnvPool, EnvPoolError
 from dds_lightning.errors import UserError
 from dds_lightning.results import RolloutResult
 from dds_lightning.rollout import Contestant, episode_seed, rollout, slots_needed
@@ -307,7 +307,7 @@ def _children_gone(pids):
 
 SCRIPT = """
 import os, signal, sys
-from dds_lightning.envpool import EnvPool
+from dds_lightning.envs.pool import EnvPool
 from dds_lightning.tasks import get_task
 pool = EnvPool(get_task("pointmaze-umaze-diverse"), 3, workers=2)
 print(*[part.process.pid for part in pool._parts], "torch" in sys.modules, flush=True)

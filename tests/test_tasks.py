@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from datamodules.collect.planner import planner_for
-from dds_lightning.environments import build_env
+from dds_lightning.envs.build import build_env
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import get_task, known_env_ids, task_names, task_table
 

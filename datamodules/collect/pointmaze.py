@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from datamodules.collect.behaviour import QUIET, BehaviourNoise, Driver
 from datamodules.collect.minari_writer import write_minari
 from datamodules.storage import refuse_existing
-from dds_lightning.environments import build_env, register_environments
+from dds_lightning.envs.build import build_env, register_environments
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import Task, get_task
 

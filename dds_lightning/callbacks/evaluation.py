@@ -11,7 +11,7 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 
 from dds_lightning.agent import AgentSelection, DDSAgent
 from dds_lightning.callbacks.resume import undisturbed
-from dds_lightning.envpool import EnvPool
+from dds_lightning.envs.pool import EnvPool
 from dds_lightning.errors import UserError
 from dds_lightning.policy import PolicyModule
 from dds_lightning.rollout import Contestant, RolloutResult, rollout, single_skills, slots_needed

@@ -7,7 +7,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -154,8 +155,8 @@ def fit_clone(
     directory: str | Path,
     *,
     seed: int = 0,
-    steps: int = 4000,
-    batch_size: int = 1024,
+    steps: int = 3000,
+    batch_size: int = 512,
     lr: float = 1e-3,
     hidden_dims: Sequence[int] = (256, 256),
     progress: bool = True,
@@ -208,7 +209,18 @@ def fit_clone(
     saving = RollingCheckpoint(str(directory))
     trainer = pl.Trainer(**trainer_settings(settings, [saving]))
     last = directory / "last.ckpt"
-    with interrupts.deferred():
+    with interrupts.deferred(), _one_thread():
         trainer.fit(clone, module, ckpt_path=last if last.is_file() else None, weights_only=True)
     assert saving.path is not None
     return saving.path
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """One thread for a network so small: more gain little on an idle machine and cost much on a busy one."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

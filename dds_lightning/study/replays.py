@@ -19,8 +19,11 @@ Arrays = dict[str, NDArray[np.generic]]
 
 
 def junctions(task: Task, count: int = 8) -> tuple[Cell, ...]:
-    """The task's start, then cells with several ways out, each as far as can be from those before it."""
-    free = set(task.free_cells())
+    """The task's start, then cells with several ways out, each as far as can be from those before it.
+
+    The goal's cell is left out: there every episode is over at once.
+    """
+    free = set(task.free_cells()) - {task.goal_cell}
 
     def ways(place: Cell) -> int:
         i, j = place
@@ -29,7 +32,7 @@ def junctions(task: Task, count: int = 8) -> tuple[Cell, ...]:
     assert task.start_cell is not None, "mazes have a start"
     chosen = [task.start_cell]
     for least in (3, 2, 1):  # where several ways lead on, skills differ most
-        places = [place for place in task.free_cells() if ways(place) >= least]
+        places = [place for place in task.free_cells() if place in free and ways(place) >= least]
         while len(chosen) < min(count, len(free)) and (rest := [p for p in places if p not in chosen]):
             chosen.append(max(rest, key=lambda p: min(abs(p[0] - c[0]) + abs(p[1] - c[1]) for c in chosen)))
     return tuple(chosen)
@@ -42,11 +45,11 @@ def replay_skills(task: Task, agent: DDSAgent, steps: int = 50, seed: int = 0) -
         task: a maze.
         agent: its decoder is used, its policy is not.
         steps: T of each replay, if it does not reach the goal before.
-        seed: of the environments (the exact place in the start cell) and of the decoder's noise.
+        seed: of the environments (the exact place in the cell) and of the decoder's noise.
 
     Returns:
-        `starts` (N, 2) centres of the start cells in metres, `positions` (N, T + 1, 2), `codes` (N,), `alive`
-        (N, T), with N = starts x K.
+        `starts` (N, 2) where the body was set down, the same for all skills of a cell, `positions`
+        (N, T + 1, 2) metres, `codes` (N,), `alive` (N, T), with N = cells x K.
     """
     cells = junctions(task)
     size, skills = len(cells), agent.num_skills
@@ -79,7 +82,7 @@ def replay_skills(task: Task, agent: DDSAgent, steps: int = 50, seed: int = 0) -
         for env in envs:
             env.close()
     return {
-        "starts": np.tile(np.stack([task.cell_to_xy(place) for place in cells]), (skills, 1)),
+        "starts": positions[:, :, 0].reshape(skills * size, 2),
         "positions": positions.reshape(skills * size, steps + 1, 2),
         "codes": np.repeat(np.arange(skills), size),
         "alive": alive.reshape(skills * size, steps),

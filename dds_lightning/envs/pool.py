@@ -26,13 +26,13 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from dds_lightning.envworker import Slots, pack_step, read_frame, record_dtype, write_frame
+from dds_lightning.envs.worker import Slots, pack_step, read_frame, record_dtype, write_frame
 from dds_lightning.errors import UserError
 
 if TYPE_CHECKING:
     from dds_lightning.tasks import Task
 
-_START_WORKER = "from dds_lightning.envworker import worker_main; worker_main()"
+_START_WORKER = "from dds_lightning.envs.worker import worker_main; worker_main()"
 
 
 class EnvPoolError(RuntimeError):
