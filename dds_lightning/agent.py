@@ -8,7 +8,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, get_args
 
@@ -17,8 +16,6 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from dds_lightning.actors import Actor as Actor
-from dds_lightning.actors import AgentGroup
 from dds_lightning.errors import UserError
 
 if TYPE_CHECKING:
@@ -241,13 +238,8 @@ class DDSAgent(nn.Module):
 
     @property
     def group_key(self) -> tuple[int, float | None]:
-        """Agents with equal keys can act in one decoder batch, see `group`."""
+        """Agents with equal keys can act in one decoder batch, see `actors.AgentGroup`."""
         return id(self.skill), self.noise_scale
-
-    @staticmethod
-    def group(agents: Sequence[DDSAgent]) -> AgentGroup:
-        """Agents with equal `group_key`s as one actor."""
-        return AgentGroup(agents)
 
     # ---------------------------------------------------------------- files
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dds_lightning.actors import Actor, Contestant
+from dds_lightning.actors import Actor, AgentGroup, Contestant
 from dds_lightning.errors import UserError
 
 DEFAULT_SLOTS = 192
@@ -99,7 +99,7 @@ def take_seats(bundles: list[tuple[Any, list[Contestant]]], plans: list[Plan], s
         seeds = [_actor_seed(seed, member.name) for member in members]
         actor = members[0].actor
         if len(members) > 1:
-            actor = actor.group([member.actor for member in members])
+            actor = AgentGroup([member.actor for member in members])
             actor.reset(sizes, seeds)
         else:
             actor.reset(sizes[0], seeds[0])

@@ -152,12 +152,15 @@ class Task:
         Args:
             render_mode: Gymnasium's render mode, for example "rgb_array".
         """
-        options = {"continuing_task": False} if self.maze_map is not None else {}
-        from dds_lightning.envs.build import TaskEnv, build_env
+        from dds_lightning.envs.build import MazeTask, TaskEnv, build_env  # gymnasium is slow to import
 
+        options, maze = {}, None
+        if self.maze_map is not None:
+            options = {"continuing_task": False}
+            maze = MazeTask(self.start_cell, self.goal_cell, self.goal_radius, self.cell_to_xy)
         cap = self.max_episode_steps
         env = build_env(self.env_id, max_episode_steps=cap, render_mode=render_mode, **options)
-        return TaskEnv(env, self)
+        return TaskEnv(env, self.observation_dim, maze)
 
 
 # ---------------------------------------------------------------------- the table

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import nn
 
+from dds_lightning.actors import AgentGroup
 from dds_lightning.agent import DDSAgent
 from dds_lightning.errors import UserError
 from dds_lightning.policy import PolicyModule
@@ -269,7 +270,7 @@ def test_a_group_acts_as_its_members_would():
         DDSAgent(skill, None, "fixed", fixed_codes=[0, 2], noise_scale=0.0),
     ]
     alone = [DDSAgent(m.skill, m.policy, m.selection, 1.0, 0.0, m.fixed_codes) for m in members]
-    group = DDSAgent.group(members)
+    group = AgentGroup(members)
     group.reset([2, 1, 4], [0, 0, 0])
     for own, size in zip(alone, (2, 1, 4), strict=True):
         own.reset(size, 0)

@@ -6,43 +6,50 @@ import contextlib
 import io
 import tempfile
 import threading
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from dds_lightning.tasks import Task
-
 _BUILD_LOCK = threading.Lock()
+
+
+class MazeTask(NamedTuple):
+    """Where in a maze an episode starts and ends."""
+
+    start_cell: tuple[int, int] | None
+    goal_cell: tuple[int, int] | None
+    goal_radius: float
+    cell_to_xy: Callable[[Any], NDArray[np.float64]]
 
 
 class TaskEnv(gym.Wrapper[NDArray[np.float32], NDArray[np.float32], Any, Any]):
     """Flattens observations and pins start and goal; see `Task.make_env`."""
 
-    def __init__(self, env: gym.Env[Any, Any], task: Task) -> None:
+    def __init__(self, env: gym.Env[Any, Any], observation_dim: int, maze: MazeTask | None = None) -> None:
         """Wrap `env`, which must come from `build_env`."""
         super().__init__(env)
-        self.task = task
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (task.observation_dim,), np.float32)
+        self.maze = maze
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (observation_dim,), np.float32)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Start an episode; `options` may override `reset_cell` and `goal_cell`."""
-        if self.task.maze_map is None:
+        if self.maze is None:
             observation, info = self.env.reset(seed=seed, options=options)
             return self._outside(observation, info)
-        cells = {"reset_cell": self.task.start_cell, "goal_cell": self.task.goal_cell, **(options or {})}
+        cells = {"reset_cell": self.maze.start_cell, "goal_cell": self.maze.goal_cell, **(options or {})}
         observation, info = self.env.reset(seed=seed, options=cells)
-        maze: Any = self.env.unwrapped
+        inner: Any = self.env.unwrapped
         # The environment moves the goal by up to a quarter of a cell; one task has one goal, so put it back.
-        maze.goal = self.task.cell_to_xy(cells["goal_cell"])
-        maze.update_target_site_pos()
+        inner.goal = self.maze.cell_to_xy(cells["goal_cell"])
+        inner.update_target_site_pos()
         flat, info = self._outside(observation, info)
-        info["success"] = bool(np.linalg.norm(info["position"] - maze.goal) <= self.task.goal_radius)
+        info["success"] = bool(np.linalg.norm(info["position"] - inner.goal) <= self.maze.goal_radius)
         return flat, info
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
@@ -53,7 +60,7 @@ class TaskEnv(gym.Wrapper[NDArray[np.float32], NDArray[np.float32], Any, Any]):
 
     def _outside(self, observation: Any, info: dict[str, Any]) -> tuple[NDArray[np.float32], dict[str, Any]]:
         info["success"] = bool(info.get("success", False))
-        if self.task.maze_map is not None:
+        if self.maze is not None:
             info["position"] = np.array(observation["achieved_goal"], dtype=np.float64)
             observation = observation["observation"]
         return np.asarray(observation, dtype=np.float32), info

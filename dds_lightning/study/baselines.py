@@ -155,7 +155,7 @@ def fit_clone(
     directory: str | Path,
     *,
     seed: int = 0,
-    steps: int = 3000,
+    steps: int = 4000,
     batch_size: int = 512,
     lr: float = 1e-3,
     hidden_dims: Sequence[int] = (256, 256),

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
+from dds_lightning.study.findings import Findings
 from dds_lightning.study.tables import BEST, CONTESTANT, SKILL, ends, markdown, readable
-
-if TYPE_CHECKING:
-    from dds_lightning.study.report import Findings
 
 _OTHERS = 3
 """Commonest ends that are listed for each contestant beside the main one."""

@@ -1,0 +1,84 @@
+"""What a finished run found: everything a report tells, read back from the run's files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from dds_lightning.errors import UserError
+from dds_lightning.results import RolloutResult
+from dds_lightning.study.tables import failures_table, skills_table, summary_table
+from dds_lightning.tasks import Task, get_task
+
+STAGES = ("data", "skill", "relabel", "policy", "clone", "evaluate")
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """Everything a report tells, read from one run directory.
+
+    Attributes:
+        root: the run directory.
+        task: what was played.
+        result: the evaluation's episodes and paths.
+        main: the contestant the run is about: the published agent as it acts by default.
+        singles: the contestant whose parts are the single skills; None if they did not play.
+        summary: see `tables.summary_table`.
+        failures: see `tables.failures_table`.
+        skills: see `tables.skills_table`.
+        markers: stage -> its marker.
+    """
+
+    root: Path
+    task: Task
+    result: RolloutResult
+    main: str
+    singles: str | None
+    summary: pd.DataFrame
+    failures: pd.DataFrame
+    skills: pd.DataFrame
+    markers: Mapping[str, Mapping[str, Any]]
+
+    @classmethod
+    def read(cls, root: Path) -> Findings:
+        """Read a run directory.
+
+        Raises:
+            UserError: it holds no evaluation, or one of a task that this version does not know.
+        """
+        if not (root / "evaluate" / "episodes.parquet").is_file():
+            raise UserError(
+                f"{root} holds no evaluation (evaluate/episodes.parquet): expected a directory that `dds run` "
+                "has brought at least as far as its stage 'evaluate'"
+            )
+        result = RolloutResult.load(root / "evaluate")
+        episodes = result.episodes
+        task = get_task(result.task)
+        main = str(episodes["actor"].iloc[0])
+        parts = episodes.groupby("actor", sort=False)["label"].nunique()
+        singles = next((str(name) for name in parts.index[parts > 1]), None)
+        usage = root / "relabel" / "codes.csv"
+        return cls(
+            root,
+            task,
+            result,
+            main,
+            singles,
+            summary_table(episodes),
+            failures_table(episodes, task),
+            skills_table(
+                episodes.loc[episodes["actor"] == main, "codes"],
+                pd.read_csv(usage) if usage.is_file() else None,
+                episodes[episodes["actor"] == singles] if singles else None,
+            ),
+            {stage: marker for stage in STAGES if (marker := _marker(root / stage / "stage.json"))},
+        )
+
+
+def _marker(path: Path) -> dict[str, Any]:
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
