@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+import warnings
 from pathlib import Path
 
 import pytest
@@ -365,3 +366,13 @@ def test_a_reader_that_leaves_early_is_no_error():
     )
     assert ran.stdout == "[\n"
     assert ran.stderr == ""
+
+
+def test_a_warning_is_a_sentence_without_a_place_in_the_code(capsys, monkeypatch):
+    def warn(words):
+        warnings.warn("two of nine episodes\n are short", stacklevel=1)
+        return 0
+
+    monkeypatch.setattr("dds_lightning.cli._dispatch", warn)
+    assert main(["tasks"]) == 0
+    assert capsys.readouterr().err == "dds: warning: two of nine episodes are short\n"

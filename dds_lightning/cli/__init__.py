@@ -8,6 +8,7 @@ and logs go to standard error.
 
 import shlex
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from typing import Any
@@ -31,7 +32,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if argv is None else argv)
     try:
-        with caught():
+        with caught(), warnings.catch_warnings():
+            warnings.showwarning = _warn
             return _dispatch(words)
     except UserError as error:
         return _complain(str(error))
@@ -94,6 +96,11 @@ def _report(work: Callable[[], Any], as_json: bool) -> int:
         report.print(as_json)
         return report.status
     return 0
+
+
+def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
+    """A warning as a sentence: where in the code it was raised says nothing to whoever types a command."""
+    print(f"dds: warning: {' '.join(str(message).split())}", file=sys.stderr)
 
 
 def _complain(message: str) -> int:
