@@ -325,11 +325,10 @@ class PolicyModule(StageModule):
     @torch.no_grad()
     def on_train_batch_end(self, outputs: Any, batch: dict[str, Tensor], batch_idx: int) -> None:
         """Move the target critic towards the critic."""
-        if "critic" not in self.trained_parts:
-            return
         target: list[Tensor] = list(self.target_critic.parameters())
         online: list[Tensor] = list(self.critic.parameters())
-        torch._foreach_lerp_(target, online, self.hparams.target_ema)
+        if "critic" in self.trained_parts:
+            torch._foreach_lerp_(target, online, self.hparams.target_ema)
 
     def validation_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
         """Losses on held-out transitions."""
