@@ -22,17 +22,18 @@ def learning_rate_factor(step: int, schedule: Schedule, warmup_steps: int, max_s
 
 
 def adam(
-    parameters: Iterable[nn.Parameter],
+    parameters: Iterable[nn.Parameter | dict[str, Any]],
     lr: float,
     schedule: Schedule,
     warmup_steps: int,
     module: pl.LightningModule,
 ) -> Any:
-    """Build Adam in the form Lightning expects.
+    """Build Adam in the form Lightning expects, over parameters or over groups of them with rates of their own.
 
     Reads ``trainer.max_steps`` only: ``estimated_stepping_batches`` builds the loaders early and breaks resuming.
     """
-    optimizer = torch.optim.Adam([p for p in parameters if p.requires_grad], lr=lr)
+    learning: list[Any] = [p for p in parameters if isinstance(p, dict) or p.requires_grad]
+    optimizer = torch.optim.Adam(learning, lr=lr)
     if schedule == "constant" and warmup_steps == 0:
         return optimizer
     max_steps = module.trainer.max_steps

@@ -13,23 +13,22 @@ the networks just updated.)
 
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal
 
-import lightning.pytorch as pl
 import torch
 from torch import Tensor, nn
 
 from dds_lightning import losses
 from dds_lightning.errors import UserError
+from dds_lightning.finetune import StageModule
 from dds_lightning.nn.mlp import MLP, FourierFeatures
 from dds_lightning.nn.normaliser import Normaliser
-from dds_lightning.optim import adam, is_log_step
+from dds_lightning.optim import is_log_step
 
 Selection = Literal["sample", "greedy", "argmax_q"]
 
 
-class PolicyModule(pl.LightningModule):
+class PolicyModule(StageModule):
     """Discrete IQL and AWR over the codes of a relabelled data set.
 
     A training batch is ``{"observations": (B, O), "codes": (B,), "rewards": (B,), "next_observations": (B, O),
@@ -55,13 +54,21 @@ class PolicyModule(pl.LightningModule):
         lr: Adam's learning rate.
         lr_schedule: ``constant`` (the paper) or ``cosine`` decay to zero at ``max_steps``.
         warmup_steps: steps of linear warm-up.
+        init_from: ``.ckpt`` or published directory whose weights to start from (`dds_lightning.finetune`), for new
+            rewards or a new goal; ``data.skill`` must be the skill model that this policy learnt with.
+        trainable: ``all``, ``critic`` (V and Q) or ``actor``; the rest does not change by a bit.
+        lr_scale: factor on ``lr`` by part, such as ``{actor: 0.1}``; 1 for a part that is not named.
+        refit_normaliser: with ``init_from``, take the statistics of the new data, not the checkpoint's.
         watch: look every so many steps whether the critic left the range that rewards and discounts allow.
 
     Raises:
         UserError: a setting outside its range; the message names it.
     """
 
-    hparams: Any  # Lightning gives its settings as attributes, but types them as a mapping
+    STAGE = "policy"
+    PARTS: ClassVar = {"critic": ("value", "critic", "target_critic"), "actor": ("actor",)}
+    SHAPE = ("num_skills", "hidden_dims", "layer_norm", "fourier_features", "fourier_scale")
+    OF_DATA = ("support_mask", "value_range")
     support_mask: Tensor
     value_range: Tensor
 
@@ -83,11 +90,15 @@ class PolicyModule(pl.LightningModule):
         lr: float = 1e-4,
         lr_schedule: Literal["constant", "cosine"] = "constant",
         warmup_steps: int = 0,
+        init_from: str | None = None,
+        trainable: list[str] | str = "all",
+        lr_scale: dict[str, float] | None = None,
+        refit_normaliser: bool = False,
         watch: int = 500,
     ) -> None:
         super().__init__()
         hidden_dims = list(hidden_dims)
-        self.save_hyperparameters()
+        self.save_hyperparameters(ignore=["init_from"])
         self._check_settings()
         self.num_skills = num_skills
         self.normaliser = Normaliser(observation_dim)
@@ -106,6 +117,7 @@ class PolicyModule(pl.LightningModule):
         # Which codes the data support, and what values its rewards and discounts allow; filled at the fit's start.
         self.register_buffer("support_mask", torch.ones(num_skills, dtype=torch.bool))
         self.register_buffer("value_range", torch.tensor([-torch.inf, torch.inf]))
+        self._begin(init_from)
 
     def _check_settings(self) -> None:
         h = self.hparams
@@ -118,9 +130,7 @@ class PolicyModule(pl.LightningModule):
             ("support", 0 <= h.support < 1 / h.num_skills, f"in [0, 1/{h.num_skills})"),
             ("lr", h.lr > 0, "positive"),
         ]
-        for name, fine, expected in rules:
-            if not fine:
-                raise UserError(f"model.{name} is {h[name]}, expected {expected}")
+        self._refuse(rules)
 
     # ---------------------------------------------------------------- what it says about a state
 
@@ -176,12 +186,13 @@ class PolicyModule(pl.LightningModule):
     @property
     def learns_critic(self) -> bool:
         """Whether V and Q learn in this step."""
-        return self.hparams.extraction == "joint" or self.global_step < self.hparams.critic_steps
+        first = self.hparams.extraction == "joint" or self.global_step < self.hparams.critic_steps
+        return "critic" in self.trained_parts and (first or "actor" not in self.trained_parts)
 
     @property
     def learns_actor(self) -> bool:
         """Whether the policy learns in this step."""
-        return self.hparams.extraction == "joint" or not self.learns_critic
+        return "actor" in self.trained_parts and (self.hparams.extraction == "joint" or not self.learns_critic)
 
     def critic_loss(
         self, features: Tensor, v: Tensor, target_q: Tensor, batch: dict[str, Tensor]
@@ -244,15 +255,19 @@ class PolicyModule(pl.LightningModule):
 
     def on_fit_start(self) -> None:
         """Take statistics, code support and possible values from the relabelled data."""
-        datamodule = getattr(self.trainer, "datamodule", None)
+        self.refuse_frozen_without_weights()
+        datamodule: Any = getattr(self.trainer, "datamodule", None)
+        kept: dict[str, Tensor] = {}
         if bool(self.normaliser.fitted):
-            return
-        if datamodule is None or not hasattr(datamodule, "statistics"):
+            if self.init_from is None:
+                return
+            kept = {"observation_mean": self.normaliser.mean, "observation_std": self.normaliser.std}
+        if not hasattr(datamodule, "statistics"):
             raise UserError(
                 "the policy has no statistics of the data: fit it with a RelabeledDataModule, or call "
                 "fit_statistics(...) first"
             )
-        self.fit_statistics(**datamodule.statistics())
+        self.fit_statistics(**{**datamodule.statistics(), **kept})
 
     def fit_statistics(
         self,
@@ -312,7 +327,8 @@ class PolicyModule(pl.LightningModule):
         """Move the target critic towards the critic."""
         target: list[Tensor] = list(self.target_critic.parameters())
         online: list[Tensor] = list(self.critic.parameters())
-        torch._foreach_lerp_(target, online, self.hparams.target_ema)
+        if "critic" in self.trained_parts:
+            torch._foreach_lerp_(target, online, self.hparams.target_ema)
 
     def validation_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
         """Losses on held-out transitions."""
@@ -332,14 +348,3 @@ class PolicyModule(pl.LightningModule):
     def predict_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """Greedy codes (B,) for the states of a batch."""
         return self.codes(batch["observations"], "greedy")
-
-    def configure_optimizers(self) -> Any:
-        """Adam over value, critic and policy together; a part that does not learn has no gradient and stays."""
-        return adam(self.parameters(), self.hparams.lr, self.hparams.lr_schedule, self.hparams.warmup_steps, self)
-
-    @classmethod
-    def load(cls, path: str | Path) -> Self:
-        """Load a policy from a Lightning ``.ckpt`` or a published directory, in evaluation mode on the CPU."""
-        from dds_lightning.checkpointing import load_module
-
-        return load_module(cls, path, part="policy")

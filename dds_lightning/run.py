@@ -195,7 +195,7 @@ class Run:
 
         words = self._words(stage, self.spec)
         if resuming and (folder / "last.ckpt").is_file():
-            words.append(f"--ckpt_path={folder / 'last.ckpt'}")
+            words += [f"--ckpt_path={folder / 'last.ckpt'}", "--model.init_from=null"]
         self.console.print(command_line(stage, words), style="dim", highlight=False, soft_wrap=True)
         made = StageCLI(stage, words).execute().data
         metrics = {name: round(value, 6) for name, value in made["metrics"].items()}

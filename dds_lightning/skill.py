@@ -8,28 +8,27 @@
 """
 
 from itertools import islice
-from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal
 
-import lightning.pytorch as pl
 import torch
 from torch import Tensor
 from torchmetrics import MeanMetric
 
 from dds_lightning.errors import UserError
+from dds_lightning.finetune import StageModule, refuse_other_box
 from dds_lightning.metrics import CodebookUsage
 from dds_lightning.nn.codebook import Codebook, CodebookInit, Quantised
 from dds_lightning.nn.diffusion import DiffusionDecoder, MLPDecoder, Sampler
 from dds_lightning.nn.encoder import ENCODERS
 from dds_lightning.nn.gaussian import GaussianBottleneck, GaussianSkill
 from dds_lightning.nn.normaliser import ActionBox, Normaliser
-from dds_lightning.optim import adam, is_log_step
+from dds_lightning.optim import is_log_step
 
 START_BATCHES = 64
 """Batches whose encodings start the codebook by k-means."""
 
 
-class SkillModule(pl.LightningModule):
+class SkillModule(StageModule):
     """Learn K discrete skills from segments of H steps.
 
     A training batch is ``{"observations": (B, H, O), "actions": (B, H, A)}`` in the environment's own units;
@@ -69,12 +68,21 @@ class SkillModule(pl.LightningModule):
         lr: Adam's learning rate.
         lr_schedule: ``constant`` (the paper) or ``cosine`` decay to zero at ``max_steps``.
         warmup_steps: steps of linear warm-up.
+        init_from: ``.ckpt`` or published directory whose weights to start from (`dds_lightning.finetune`).
+        trainable: ``all``, or some of ``encoder``, ``codebook`` and ``decoder``; the rest does not change by a bit.
+        lr_scale: factor on ``lr`` by part, such as ``{encoder: 0.1}``; 1 for a part that is not named.
+        refit_normaliser: with ``init_from``, take the statistics of the new data, not the checkpoint's.
 
     Raises:
         UserError: a setting outside its range; the message names it.
     """
 
-    hparams: Any  # Lightning gives its settings as attributes, but types them as a mapping
+    STAGE = "skill"
+    PARTS: ClassVar = {"encoder": ("encoder",), "codebook": ("bottleneck",), "decoder": ("decoder",)}
+    SHAPE = (
+        *("horizon", "bottleneck", "num_skills", "skill_dim", "encoder", "decoder", "hidden_dim", "encoder_layers"),
+        *("encoder_heads", "decoder_blocks", "diffusion_steps", "beta_min", "beta_max", "time_dim"),
+    )
 
     def __init__(
         self,
@@ -109,9 +117,13 @@ class SkillModule(pl.LightningModule):
         lr: float = 5e-5,
         lr_schedule: Literal["constant", "cosine"] = "constant",
         warmup_steps: int = 0,
+        init_from: str | None = None,
+        trainable: list[str] | str = "all",
+        lr_scale: dict[str, float] | None = None,
+        refit_normaliser: bool = False,
     ) -> None:
         super().__init__()
-        self.save_hyperparameters()
+        self.save_hyperparameters(ignore=["init_from"])
         self._check_settings()
         discrete = bottleneck == "vq"
         self.horizon, self.num_skills, self.discrete = horizon, num_skills, discrete
@@ -138,10 +150,12 @@ class SkillModule(pl.LightningModule):
         self.reconstruction_rmse = MeanMetric()
         self.usage = CodebookUsage(num_skills)
         self.terms: dict[str, Tensor] = {}  # of the last training step, for whoever asks what went wrong
+        self._begin(init_from)
 
     def _check_settings(self) -> None:
         """Refuse settings with which nothing can be learnt."""
         h = self.hparams
+        only_codebook = h.trainable in ("codebook", ["codebook"])
         rules = [
             ("num_skills", h.num_skills >= 2, "at least 2: with one code the policy has nothing to choose"),
             ("horizon", h.horizon >= 1, "at least 1"),
@@ -152,10 +166,10 @@ class SkillModule(pl.LightningModule):
             ("dropout", 0 <= h.dropout < 1, "in [0, 1)"),
             ("codebook_ema", h.codebook_ema is None or 0 < h.codebook_ema < 1, "null or in (0, 1)"),
             ("lr", h.lr > 0, "positive"),
+            ("trainable", not only_codebook or h.bottleneck == "vq", "all: a gaussian bottleneck has no codebook"),
+            ("trainable", not only_codebook or h.codebook_ema is None, "more, or codebook_ema: null to give it a loss"),
         ]
-        for name, fine, expected in rules:
-            if not fine:
-                raise UserError(f"model.{name} is {h[name]}, expected {expected}")
+        self._refuse(rules)
 
     # ---------------------------------------------------------------- the method
 
@@ -237,13 +251,16 @@ class SkillModule(pl.LightningModule):
 
     def on_fit_start(self) -> None:
         """Take the data's statistics and start the codebook, unless a checkpoint brought both."""
-        datamodule = getattr(self.trainer, "datamodule", None)
-        if not bool(self.normaliser.fitted):
-            if datamodule is None or not hasattr(datamodule, "statistics"):
-                raise UserError(
-                    "the skill model has no observation statistics: fit it with a SegmentDataModule, or call "
-                    "normaliser.fit(mean, std) and action_box.fit(low, high) first"
-                )
+        self.refuse_frozen_without_weights()
+        datamodule: Any = getattr(self.trainer, "datamodule", None)
+        if bool(self.normaliser.fitted):
+            refuse_other_box(self, datamodule)
+        elif not hasattr(datamodule, "statistics"):
+            raise UserError(
+                "the skill model has no observation statistics: fit it with a SegmentDataModule, or call "
+                "normaliser.fit(mean, std) and action_box.fit(low, high) first"
+            )
+        else:
             statistics = datamodule.statistics()
             self.normaliser.fit(statistics["observation_mean"], statistics["observation_std"])
             self.action_box.fit(statistics["action_low"], statistics["action_high"])
@@ -259,11 +276,9 @@ class SkillModule(pl.LightningModule):
         self.eval()
         outputs = []
         for batch in batches:
-            observations = batch["observations"].to(self.device)
-            actions = batch["actions"].to(self.device)
-            outputs.append(
-                self.encoder(torch.cat([self.normaliser(observations), self.action_box.to_unit(actions)], dim=-1))
-            )
+            observations, actions = (batch[name].to(self.device) for name in ("observations", "actions"))
+            units = [self.normaliser(observations), self.action_box.to_unit(actions)]
+            outputs.append(self.encoder(torch.cat(units, dim=-1)))
         self.train(was_training)
         return torch.cat(outputs)
 
@@ -280,11 +295,11 @@ class SkillModule(pl.LightningModule):
 
     def on_train_batch_end(self, outputs: Any, batch: dict[str, Tensor], batch_idx: int) -> None:
         """Restart dead codes from this batch, until the codebook has to settle."""
-        h = self.hparams
-        step = self.global_step
-        if not isinstance(self.bottleneck, Codebook) or h.restart_threshold <= 0 or step % h.restart_every:
+        h, step = self.hparams, self.global_step
+        if h.restart_threshold <= 0 or step % h.restart_every or "codebook" not in self.trained_parts:
             return
-        if self.trainer.max_steps > 0 and step > h.restart_until * self.trainer.max_steps:
+        settled = self.trainer.max_steps > 0 and step > h.restart_until * self.trainer.max_steps
+        if settled or not isinstance(self.bottleneck, Codebook):
             return
         generator = torch.Generator().manual_seed(step)
         moved = self.bottleneck.restart_dead(self._encodings([batch]), h.restart_threshold, generator)
@@ -306,12 +321,11 @@ class SkillModule(pl.LightningModule):
         total, terms, skill = self.loss(batch)
         observations, actions = batch["observations"], batch["actions"]
         horizon = actions.shape[1]
-        sampled = self.decode_vectors(
-            observations.flatten(0, 1), skill.vectors.repeat_interleave(horizon, dim=0), noise_scale=1.0
-        )
+        vectors = skill.vectors.repeat_interleave(horizon, dim=0)  # (B H, D)
+        sampled = self.decode_vectors(observations.flatten(0, 1), vectors, noise_scale=1.0)
         self.reconstruction_rmse.update((sampled - actions.flatten(0, 1)).square().mean(dim=-1))
-        log = {"loss": total, **terms}
-        self.log_dict({f"{stage}/{name}": value for name, value in log.items()}, batch_size=len(actions))
+        log = {f"{stage}/{name}": value for name, value in {"loss": total, **terms}.items()}
+        self.log_dict(log, batch_size=len(actions))
         if isinstance(skill, Quantised):
             self.usage.update(skill.codes)
 
@@ -334,14 +348,3 @@ class SkillModule(pl.LightningModule):
     def predict_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """Codes (B,) of a batch of segments."""
         return self.encode(batch["observations"], batch["actions"], batch.get("lengths"))
-
-    def configure_optimizers(self) -> Any:
-        """Adam over encoder, codebook and decoder together."""
-        return adam(self.parameters(), self.hparams.lr, self.hparams.lr_schedule, self.hparams.warmup_steps, self)
-
-    @classmethod
-    def load(cls, path: str | Path) -> Self:
-        """Load a skill model from a Lightning ``.ckpt`` or a published directory, in evaluation mode on the CPU."""
-        from dds_lightning.checkpointing import load_module
-
-        return load_module(cls, path, part="skill")

@@ -115,9 +115,10 @@ def _interrupted(words: list[str], stop: Interrupted) -> str:
     if stop.saved is None:
         return "interrupted"
     kept, skip = [], False
+    starts = ("--ckpt_path", "--model.init_from")  # a training that goes on does not start from anything
     for word in words:
-        if not skip and not word.startswith("--ckpt_path"):
+        if not skip and not word.startswith(starts):
             kept.append(word)
-        skip = word == "--ckpt_path"
+        skip = word in starts
     command = shlex.join(["dds", *kept, "--ckpt_path", stop.saved])
     return f"interrupted; the state is in {stop.saved}, and this goes on from it:\n  {command}"

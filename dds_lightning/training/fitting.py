@@ -114,11 +114,16 @@ class StageCLI(LightningCLI):
                 raise UserError(
                     f"--ckpt_path is missing: `dds {self.stage} {self.config.subcommand}` needs a checkpoint"
                 )
+            if settings.model.get("init_from") is not None and not self.parse_only:
+                self._take_shape(settings.model)
             return
         if settings.model.get("init_from") is not None:
-            raise UserError(
-                "--ckpt_path continues a training, --model.init_from starts a new one from weights: give one"
-            )
+            if any(word.startswith("--model.init_from") for word in self.words):
+                raise UserError(
+                    f"--ckpt_path is {path} and --model.init_from is {settings.model.init_from}: the first continues "
+                    "a training, the second starts a new one from weights; give one of them"
+                )
+            settings.model.init_from = None  # a file of settings says how the training began that goes on here
         self.checkpoint = load_checkpoint(path, self.stage)
         trained = dict(self.checkpoint["hyper_parameters"])
         chosen = self._chosen_model_settings()
@@ -131,6 +136,17 @@ class StageCLI(LightningCLI):
                 )
             if name not in LINKS[self.stage] and name in settings.model:
                 settings.model[name] = value
+
+    def _take_shape(self, model: Namespace) -> None:
+        """Take what shapes the network from the checkpoint to start from, save what the user wrote down."""
+        from dds_lightning.finetune import StageModule, read
+
+        cls: Any = modules(self.stage)[0]
+        assert issubclass(cls, StageModule)
+        trained, chosen = read(cls, model.init_from).hparams, self._chosen_model_settings()
+        for name in cls.SHAPE:
+            if name not in chosen and name not in LINKS[self.stage]:
+                model[name] = trained[name]
 
     def _chosen_model_settings(self) -> dict[str, Any]:
         """Settings of the model that the user wrote down, on the command line or in a file; no defaults."""
@@ -172,6 +188,8 @@ class StageCLI(LightningCLI):
             # Lightning makes its log folder first and looks at the data afterwards.
             self.datamodule.prepare_data()
             self.datamodule.setup(str(self.subcommand))
+        if self.subcommand == "fit" and self.checkpoint is None:
+            self.model.refuse_frozen_without_weights()
         work: Callable[..., Report] = getattr(self, f"_{self.subcommand}")
         return work(**self._prepare_subcommand_kwargs(str(self.subcommand)))
 
@@ -264,6 +282,7 @@ def quieten() -> None:
         ".*`IterableDataset` has `__len__` defined.*",
         ".*The number of training batches .* is smaller than the logging interval.*",
         ".*isinstance.treespec, LeafSpec.*",
+        ".*module.s. in eval mode at the start of training.*",  # the frozen parts of a fine-tuning
     ):
         warnings.filterwarnings("ignore", message=text)
 
