@@ -1,4 +1,4 @@
-"""The agent: a skill every H steps, an action every step (section 4.4, algorithm 2).
+"""The agent: a skill every H steps, an action every step (section 4.4).
 
 ```
  observations (E, O) ─► policy ─► codes (E,)   at each environment's own reset, then every H of its steps

@@ -98,7 +98,7 @@ def _legend(ax: Axes, title: str, codes: NDArray[Any], label: Callable[[int, flo
 
 
 def plot_trajectories(task: Task, result: RolloutResult, actor: str, episodes: int = 12, numbered: int = 1) -> Figure:
-    """Episodes of one contestant over the maze, coloured by the skill in use (figure 4 d and h of the paper).
+    """Episodes of one contestant over the maze, coloured by the skill in use (the paper's AntMaze figure, d and h).
 
     Args:
         task: the maze.
@@ -159,7 +159,7 @@ def plot_starts_by_skill(
     codes: NDArray[Any],
     alive: NDArray[Any] | None = None,
 ) -> Figure:
-    """Each skill from several starts, one panel a skill (figure 4 a to c and e to g of the paper).
+    """Each skill from several starts, one panel a skill (the paper's AntMaze figure, a to c).
 
     Args:
         task: the maze.

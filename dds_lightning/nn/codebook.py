@@ -66,7 +66,7 @@ class Codebook(nn.Module):
     @torch.autocast("cpu", enabled=False)
     @torch.autocast("cuda", enabled=False)
     def nearest(self, encodings: Tensor) -> Tensor:
-        """Code of the nearest vector (equation 10): encodings (B, D) to int64 (B,)."""
+        """Code of the nearest vector (equation 11): encodings (B, D) to int64 (B,)."""
         return torch.cdist(encodings.detach().float(), self.vectors.detach().float()).argmin(dim=-1)
 
     def lookup(self, codes: Tensor) -> Tensor:
