@@ -33,7 +33,7 @@ def agent_card(
     first = table.iloc[0]
     facts = "\n".join(f"- {name}: {value}" for name, value in data.items())
     trained = "\n".join(_training(stage, chosen) for stage, chosen in settings.items())
-    what = f"cell {task.start_cell} to cell {task.goal_cell} of " if task.maze_map is not None else ""
+    what = f"From cell {task.start_cell} to cell {task.goal_cell} of " if task.maze_map is not None else ""
     return f"""# {task.name}: an agent with discrete diffusion skills
 
 {what}{task.env_id}, at most {task.max_episode_steps} steps. **{first["contestant"]}: {first["success"]:.1f} % of
