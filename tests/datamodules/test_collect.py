@@ -206,7 +206,13 @@ def test_ctrl_c_with_many_processes_leaves_nothing(tmp_path: Path) -> None:
     call = f"collect_pointmaze({LARGE!r}, 2_000_000, 0, {str(out)!r}, workers=2, progress=False)"
     script = _script(tmp_path, f"if __name__ == '__main__':\n    {call}")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    process = subprocess.Popen([sys.executable, script], env=environment, start_new_session=True)
+    process = subprocess.Popen(
+        [sys.executable, script],
+        env=environment,
+        start_new_session=True,
+        # A shell that runs the tests in the background lets its children ignore Ctrl-C.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     deadline = time.monotonic() + 60
     while not (out.is_dir() and any(out.glob(".*/data/main_data.hdf5"))):
         assert time.monotonic() < deadline
