@@ -8,7 +8,7 @@ BIN    := $(VENV)/bin
 PYTEST_ARGS ?= -n auto --dist loadscope
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format notebooks-env clean
+.PHONY: help demo test lint format notebooks notebooks-env clean
 
 help:  ## show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */\1|/' | awk -F'|' '{printf "  make %-14s %s\n", $$1, $$2}'
@@ -39,6 +39,9 @@ lint: $(VENV)/.installed  ## ruff and mypy, changing nothing
 format: $(VENV)/.installed  ## let ruff mend what it can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+notebooks: $(VENV)/.notebooks  ## execute all notebooks anew, about five minutes
+	$(BIN)/python notebooks/execute.py
 
 notebooks-env: $(VENV)/.notebooks  ## add Jupyter to the environment
 

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from datamodules.inspection import check_dataset as check_dataset
     from datamodules.inspection import describe as describe
     from datamodules.inspection import find_datasets as find_datasets
-    from datamodules.relabel import relabel as relabel
     from datamodules.relabeled import RelabeledDataModule as RelabeledDataModule
     from datamodules.segments import SegmentDataModule as SegmentDataModule
     from datamodules.segments import TensorLoader as TensorLoader
@@ -35,7 +34,6 @@ _HOMES = {
     "describe": "datamodules.inspection",
     "find_datasets": "datamodules.inspection",
     "load_trajectories": "datamodules.sources",
-    "relabel": "datamodules.relabel",
 }
 
 

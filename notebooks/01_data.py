@@ -1,0 +1,245 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # 01 · Environment and data
+#
+# **What you will see:** the maze and its physics, 20,000 steps of data collected on the spot, where those drives went,
+# how they are cut into segments, and what happens to data that are broken: they are refused, with a sentence that says
+# what is wrong and where.
+#
+# **Time:** less than one minute on two CPU cores. No network, no GPU, no graphics driver.
+
+# %%
+# %matplotlib inline
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from datamodules import DataError, Trajectories, check_dataset, collect_pointmaze, describe, load_trajectories
+from dds_lightning import get_task
+from dds_lightning.interpret.drawing import draw_starts, draw_trail, draw_walls
+
+RUNS = Path(os.environ.get("DDS_NOTEBOOK_RUNS", "../runs/notebooks"))  # what the notebooks write lies here
+LIMIT = int(os.environ.get("DDS_NOTEBOOK_STEPS", 1_000_000))  # a small number makes a quick, meaningless run
+STEPS = min(20_000, 100 * LIMIT)
+HORIZON = 10
+
+# %% [markdown]
+# ## The environment
+#
+# A task is one row of a table: which environment, from where to where, how long. The ball has mass, so pushing changes
+# its *velocity*; a push against a wall costs time and teaches nothing. The evaluation always starts at the star and
+# ends in the circle.
+
+# %%
+task = get_task("pointmaze-large-diverse")
+figure = Figure(figsize=(5.0, 3.9), layout="constrained")
+ax = figure.add_subplot()
+draw_walls(ax, task)
+draw_starts(ax, [task.start_xy()], task.cell_size, size=16)
+ax.set_title(f"{task.env_id}: at most {task.max_episode_steps} steps")
+figure
+
+# %% [markdown]
+# Push to the right for half a second (50 steps of 0.01 s) and watch position and velocity:
+
+# %%
+env = task.make_env()
+observation, info = env.reset(seed=0)
+rows = []
+for step in range(51):
+    if step % 10 == 0:
+        rows.append([step, *observation])
+    observation, reward, terminated, truncated, info = env.step(np.array([0.2, 0.0], np.float32))
+pd.DataFrame(rows, columns=["step", "x (m)", "y (m)", "vx (m/s)", "vy (m/s)"]).round(2)
+
+# %% [markdown]
+# ## Collect
+#
+# Offline learning needs drives that somebody else made. Here a planner finds a way over the cells and a controller
+# follows it, always to **random goals**, never on purpose to ours. It is noisy on purpose too: it strays from the
+# middle of the way, has bursts of random pushes, and sometimes brakes and rests. Data without walls, dead ends and rest
+# would leave the learner guessing there, and it guesses too well of the unknown.
+
+# %%
+folder = collect_pointmaze(task, steps=STEPS, seed=0, out=RUNS, workers=1, overwrite=True, progress=False)
+recorded = load_trajectories(f"local:{folder}", task, reward="recorded")
+print(f"{recorded.num_steps:,} steps in {recorded.num_episodes} episodes, in the format of Minari: {folder.name}")
+
+# %% [markdown]
+# ## Look at them
+#
+# Six episodes on the left, one colour each, and how often every place was visited on the right. What is white on the
+# right was never seen.
+
+# %%
+figure = Figure(figsize=(9.5, 3.9), layout="constrained")
+left, right = figure.subplots(1, 2)
+for number in range(min(6, recorded.num_episodes)):
+    positions = recorded.episode(number)["observations"][:, :2]
+    draw_trail(left, positions, number, linewidth=1.2)
+    draw_starts(left, [positions[0]], task.cell_size, size=9)
+left.set_title("six drives to random goals")
+x, y = recorded.observations[:, :2].T
+right.hist2d(x, y, bins=(48, 36), range=((-6, 6), (-4.5, 4.5)), cmin=1, cmap="viridis", norm="log")
+right.set_title("visits, dark to bright (logarithmic)")
+for ax in (left, right):
+    draw_walls(ax, task)
+figure
+
+# %% [markdown]
+# ## The reward of our goal
+#
+# The drives had other goals, so what was recorded as reward is of no use. `load_trajectories` gives every step the
+# reward of *this* task: 1 on entering the goal circle, 0 elsewhere. The episode **terminates** there (there is nothing
+# left to earn), and what follows becomes an episode of its own. That a recording merely stopped is a **truncation**:
+# life would have gone on, and the learner may look beyond. Confusing the two is a classic mistake. (Steps that stay in
+# the circle after a success are left out.)
+
+# %%
+data = load_trajectories(f"local:{folder}", task)
+facts, dimensions = describe(data, task=task, horizon=HORIZON)
+before, _ = describe(recorded, horizon=HORIZON)
+pd.DataFrame({"as recorded": before, "for our goal": facts}).drop("fingerprint").fillna("")
+
+# %% [markdown]
+# What the learner gets to see, column by column (observation 0 to 3 are $x, y, v_x, v_y$):
+
+# %%
+dimensions.round(2)
+
+# %% [markdown]
+# ## Segments
+#
+# Skills are learnt from segments $\tau = (s_1, a_1, \dots, s_H, a_H)$ of $H = 10$ steps. Every step of an episode
+# starts one, and none crosses the end of an episode. A tenth of a second is short: in this maze a skill is a push, not
+# a route.
+
+# %%
+windows = data.windows(HORIZON)
+first = windows.observation_starts
+moved = np.linalg.norm(data.observations[first + HORIZON, :2] - data.observations[first, :2], axis=1)
+speed = np.linalg.norm(data.observations[first, 2:], axis=1)
+figure = Figure(figsize=(9.5, 2.6), layout="constrained")
+left, right = figure.subplots(1, 2)
+left.hist(moved, bins=40, color="#2779d2")
+left.set(xlabel="distance covered in a segment (m)", ylabel="segments")
+right.hist(speed, bins=40, color="#10a06f")
+right.set(xlabel="speed at its start (m/s)")
+for ax in (left, right):
+    ax.spines[["top", "right"]].set_visible(False)
+figure
+
+# %% [markdown]
+# ## What a refusal looks like
+#
+# File formats accept almost anything, and a learner trained on broken data fails late and silently. So everything is
+# checked on the way in, and a refusal names data set, episode, field and value. Six ways to go wrong:
+
+# %%
+good = data.episode(0)
+
+
+def broken(field: str, change) -> Trajectories:
+    """Our first episode with one field changed."""
+    episode = {name: array.copy() for name, array in good.items()}
+    episode[field] = change(episode[field])
+    return Trajectories.from_episodes("my data", [episode])
+
+
+def with_nan(observations):
+    observations[42, 2] = np.nan
+    return observations
+
+
+def mislabelled() -> dict:
+    """A copy of the data whose own description says that it comes from another maze."""
+    copy = RUNS / "mislabelled"
+    shutil.rmtree(copy, ignore_errors=True)
+    shutil.copytree(folder, copy)
+    file = copy / "data" / "metadata.json"
+    metadata = json.loads(file.read_text())
+    metadata["env_spec"] = metadata["env_spec"].replace("PointMaze_Large-v3", "PointMaze_Medium-v3")
+    file.write_text(json.dumps(metadata))
+    return check_dataset(f"local:{copy}", task)
+
+
+def damaged() -> dict:
+    """A copy of the data cut off in the middle, as a full disk leaves it."""
+    copy = RUNS / "damaged"
+    shutil.rmtree(copy, ignore_errors=True)
+    shutil.copytree(folder, copy)
+    file = copy / "data" / "main_data.hdf5"
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    return check_dataset(f"local:{copy}", task)
+
+
+attempts = {
+    "a value that is not a number": lambda: broken("observations", with_nan),
+    "the last observation is missing": lambda: broken("observations", lambda o: o[:-1]),
+    "actions in newtons, not in the box": lambda: broken("actions", lambda a: 100 * a),
+    "an episode without an end": lambda: broken("truncations", lambda t: t & False),
+    "the data of another maze": mislabelled,
+    "a file cut off half-way": damaged,
+}
+refusals = {}
+for mistake, attempt in attempts.items():
+    try:
+        attempt()
+    except DataError as error:
+        refusals[mistake] = str(error)
+        print(f"{mistake}:\n    {error}\n")
+
+# %% [markdown]
+# ## What you should see
+
+# %%
+checks = pd.DataFrame(
+    [
+        ("steps collected", recorded.num_steps, STEPS, STEPS),
+        ("free cells visited", len(np.unique(task.xy_to_cell(data.observations[:, :2]), axis=0)), 44, 46),
+        ("episodes that reach our goal", facts["episodes that reach the goal"], 3, 40),
+        ("segments", len(windows), 0.95 * STEPS, STEPS),
+        ("median distance in a segment, m", np.median(moved), 0.25, 0.45),
+        ("refusals", len(refusals), 6, 6),
+    ],
+    columns=["what", "found", "at least", "at most"],
+)
+checks["fine"] = checks["found"].between(checks["at least"], checks["at most"])
+assert checks["fine"].all() or LIMIT < 1_000_000, checks
+assert len(refusals) == 6
+checks.round(2)
+
+# %% [markdown]
+# ## Exercises
+#
+# 1. Collect with `action_noise=0, burst_probability=0`. Which parts of the picture of visits become white, and what is
+#    the share of segments that start at less than 0.2 m/s?
+# 2. Collect `pointmaze-large-play` instead: its drives run between ten hand-picked cells. Draw them. How many reach our
+#    goal now?
+# 3. Bring your own: write two episodes as plain arrays and give them to `Trajectories.from_episodes`. Forget
+#    `terminations`; what does the refusal say?
+#
+# ## The same at full size
+#
+# ```bash
+# dds data collect pointmaze-large-diverse --steps 200000 --out data
+# dds data check data/pointmaze-large-diverse-v0 --task pointmaze-large-diverse
+# ```
+#
+# Next: [02 · Learn skills](02_learn_skills.ipynb).
