@@ -111,10 +111,14 @@ class RelabeledDataModule(pl.LightningDataModule):
             "reward_shift": shift if h.reward_shift is None else h.reward_shift,
         }
 
+    @cached_property
+    def key(self) -> dict[str, str | int | float]:
+        """Everything the relabelled data depend on; hashes data and weights, so worked out once."""
+        return relabel_key(self.trajectories, self.skill, **self.settings)
+
     def cache_file(self) -> Path:
         """Where the relabelled data of exactly these inputs lie."""
-        key = relabel_key(self.trajectories, self.skill, **self.settings)
-        name = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:16]
+        name = hashlib.sha256(json.dumps(self.key, sort_keys=True).encode()).hexdigest()[:16]
         return self._cache_folder() / f"relabelled-{name}.safetensors"
 
     def _cache_folder(self) -> Path:
@@ -130,16 +134,15 @@ class RelabeledDataModule(pl.LightningDataModule):
         """Relabel, unless the result of exactly these inputs is on disk."""
         if self.hparams.relabelled is None and not self.cache_file().exists():
             made = relabel(self.trajectories, self.skill, **self.settings, progress=True)
-            made.save(self.cache_file(), relabel_key(self.trajectories, self.skill, **self.settings))
+            made.save(self.cache_file(), self.key)
             log.info("relabelled %d segments into %s", len(made), self.cache_file())
 
     def setup(self, stage: str | None = None) -> None:
         """Read the transitions and split them by episode."""
         if self.transitions is not None:
             return
-        key = relabel_key(self.trajectories, self.skill, **self.settings)
         path = Path(self.hparams.relabelled) if self.hparams.relabelled else self.cache_file()
-        self.transitions = Relabelled.load(path, key)
+        self.transitions = Relabelled.load(path, self.key)
         h = self.hparams
         _, held_out = self.trajectories.split(h.validation_fraction, h.seed, self.skill.horizon)
         kept = torch.isin(self.transitions.episodes, torch.as_tensor(held_out))

@@ -15,11 +15,12 @@ from torch import Tensor
 from datamodules.sources import load_trajectories
 from datamodules.trajectories import Trajectories, Windows
 from dds_lightning.errors import UserError
+from dds_lightning.nn.normaliser import MIN_STD
 from dds_lightning.tasks import get_task
 
 Batch = dict[str, Tensor]
 
-STD_FLOOR = 1e-3
+STD_FLOOR = MIN_STD
 """Standard deviations are at least this, so that an observation that never changes does not divide by
 zero."""
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from datamodules.validation import DataError
 from dds_lightning.errors import UserError
+from dds_lightning.files import sync
 
 FORMAT = 1
 
@@ -36,10 +37,10 @@ def save_arrays(
     try:
         partial.chmod(0o755)
         for key, array in arrays.items():
-            with (partial / f"{key}.npy").open("wb") as file:
+            path = partial / f"{key}.npy"
+            with path.open("wb") as file:
                 np.save(file, array, allow_pickle=False)
-                file.flush()
-                os.fsync(file.fileno())
+            sync(path)
         write_durably(partial / "trajectories.json", json.dumps({"format": FORMAT, **facts}, indent=1))
         put_in_place(partial, folder, overwrite)
     except BaseException:
@@ -92,10 +93,8 @@ def refuse_existing(folder: Path, overwrite: bool) -> None:
 
 def write_durably(path: Path, text: str) -> None:
     """Write a text file and wait until it is on the disk."""
-    with path.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
+    path.write_text(text, encoding="utf-8")
+    sync(path)
 
 
 def put_in_place(partial: Path, folder: Path, overwrite: bool) -> None:
@@ -108,9 +107,4 @@ def put_in_place(partial: Path, folder: Path, overwrite: bool) -> None:
     os.replace(partial, folder)
     if old is not None:
         shutil.rmtree(old, ignore_errors=True)
-    if os.name == "posix":
-        handle = os.open(folder.parent, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+    sync(folder.parent)
