@@ -283,7 +283,7 @@ class SegmentDataModule(pl.LightningDataModule):
         if self.task is None:
             return "data: neither a task nor data were given; give at least data, for example local:DIR"
         collected = f"`dds data collect {self.task.name} --out data`"
-        place = f"local:data/{self.task.data_ids.get('minari', self.task.name)}"
+        place = f"local:data/{self.task.data_ids.get('local', self.task.name)}"
         return f"data: none was given for task '{self.task.name}'; {collected} makes some, then give {place}"
 
     def _loader(self, segments: NDArray[np.int64], **options: Any) -> TensorLoader:

@@ -99,7 +99,7 @@ def collect_pointmaze(
         rest_share=rest_share,
         start_offset=start_offset,
     )
-    name = dataset_id or task.data_ids["minari"]
+    name = dataset_id or task.data_ids["local"]
     refuse_existing(Path(out) / name, overwrite)
 
     recorder = _Recorder(task, seed, steps, episode_steps, speed, noise)

@@ -27,6 +27,21 @@ _TRUSTED_PACKAGES = ("gymnasium", "gymnasium_robotics")
 
 def load_minari_id(dataset_id: str, task: Task | None) -> Trajectories:
     """Read a data set of Minari's local store, by its id."""
+    return load_local(str(_minari_folder(dataset_id)), task)
+
+
+def minari_env_id(dataset_id: str) -> str | None:
+    """The environment that a data set of Minari's local store was recorded in; None where it does not say."""
+    return local_env_id(str(_minari_folder(dataset_id)))
+
+
+def local_env_id(directory: str) -> str | None:
+    """The same for a folder."""
+    spec = read_metadata(_data_folder(directory))["env_spec"]
+    return None if spec is None else str(spec["id"])
+
+
+def _minari_folder(dataset_id: str) -> Path:
     if not re.fullmatch(r"[\w-]+(/[\w-]+)*", dataset_id):
         raise UserError(f"data: '{dataset_id}' is no Minari id; one is pointmaze-large-diverse-v0")
     folder = minari_root() / dataset_id
@@ -35,7 +50,7 @@ def load_minari_id(dataset_id: str, task: Task | None) -> Trajectories:
             f"data set '{dataset_id}' is not in {minari_root()}; collect it with `dds data collect`, "
             "download it with `minari download`, or set MINARI_DATASETS_PATH"
         )
-    return load_local(str(folder), task)
+    return folder
 
 
 def minari_root() -> Path:
@@ -49,10 +64,9 @@ def load_local(directory: str, task: Task | None) -> Trajectories:
     Raises:
         DataError: For anything missing, damaged, dangerous or of another task.
     """
-    folder = Path(directory).expanduser()
-    data = folder / "data" if (folder / "data").is_dir() else folder
+    data = _data_folder(directory)
     metadata = read_metadata(data)
-    name = str(metadata.get("dataset_id", folder.name))
+    name = str(metadata.get("dataset_id", Path(directory).name))
     if task is not None:
         _check_task(name, metadata, task)
     low, high = _action_box(name, metadata)
@@ -71,6 +85,11 @@ def load_local(directory: str, task: Task | None) -> Trajectories:
         action_dim=task.action_dim if task else len(low),
         episode_names=labels,
     )
+
+
+def _data_folder(directory: str) -> Path:
+    folder = Path(directory).expanduser()
+    return folder / "data" if (folder / "data").is_dir() else folder
 
 
 def read_metadata(data: Path) -> dict[str, Any]:

@@ -1,0 +1,103 @@
+"""From the environments as they are to those of our tasks: flat observations, one start, one goal."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from dds_lightning.envs.build import build_env
+from dds_lightning.envs.kitchen import goal_vector, kitchen_layout
+
+if TYPE_CHECKING:
+    from dds_lightning.tasks import Task
+
+Flat = NDArray[np.float32]
+
+
+def make_task_env(task: Task, render_mode: str | None = None) -> gym.Env[Flat, Flat]:
+    """Build what `Task.make_env` promises."""
+    adapters = {"flat": TaskEnv, "maze": MazeEnv, "kitchen": KitchenEnv}
+    options = {"continuing_task": False} if task.adapter == "maze" else {}
+    env = build_env(
+        task.env_id,
+        max_episode_steps=task.max_episode_steps,
+        render_mode=render_mode,
+        **options,
+        **task.env_options,
+    )
+    return adapters[task.adapter](env, task)
+
+
+class TaskEnv(gym.Wrapper[Flat, Flat, Any, Any]):
+    """An environment whose observations are flat already, and which tells `success` itself or has none."""
+
+    def __init__(self, env: gym.Env[Any, Any], task: Task) -> None:
+        """Wrap `env`, which must come from `build_env`."""
+        super().__init__(env)
+        self.task = task
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (task.observation_dim,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Flat, dict[str, Any]]:
+        """Start an episode."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._outside(observation, info)
+
+    def step(self, action: Flat) -> tuple[Flat, float, bool, bool, dict[str, Any]]:
+        """One step of the environment."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        flat, info = self._outside(observation, info)
+        return flat, float(reward), bool(terminated), bool(truncated), info
+
+    def _outside(self, observation: Any, info: dict[str, Any]) -> tuple[Flat, dict[str, Any]]:
+        """What the agent sees, and what the caller is told."""
+        info["success"] = bool(info.get("success", False))
+        return np.asarray(self.flatten(observation), dtype=np.float32), info
+
+    def flatten(self, observation: Any) -> Any:
+        """The task's flat observation, (O,)."""
+        return observation
+
+
+class MazeEnv(TaskEnv):
+    """A maze of gymnasium-robotics: pins start and goal."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Flat, dict[str, Any]]:
+        """Start an episode; `options` may override `reset_cell` and `goal_cell`."""
+        task = self.task
+        cells = {"reset_cell": task.start_cell, "goal_cell": task.goal_cell, **(options or {})}
+        cells = {name: np.asarray(cell) for name, cell in cells.items()}
+        observation, info = self.env.reset(seed=seed, options=cells)
+        inner: Any = self.env.unwrapped
+        # The environment moves the goal by up to a quarter of a cell; one task has one goal, so put it back.
+        inner.goal = task.cell_to_xy(cells["goal_cell"])
+        inner.update_target_site_pos()
+        flat, info = self._outside(observation, info)
+        info["success"] = bool(np.linalg.norm(info["position"] - inner.goal) <= task.goal_radius)
+        return flat, info
+
+    def _outside(self, observation: Any, info: dict[str, Any]) -> tuple[Flat, dict[str, Any]]:
+        info["position"] = np.array(observation["achieved_goal"], dtype=np.float64)
+        return super()._outside(observation, info)
+
+    def flatten(self, observation: Any) -> Any:
+        """A point mass' own observation; an ant's lacks its position, and newer ones add contact forces."""
+        seen = observation["observation"]
+        if self.task.family == "antmaze":
+            seen = np.concatenate([observation["achieved_goal"], seen[:27]])
+        return seen
+
+
+class KitchenEnv(TaskEnv):
+    """FrankaKitchen-v1 with D4RL's 60 numbers; `info["subtasks_done"]` counts what is done so far."""
+
+    def _outside(self, observation: Any, info: dict[str, Any]) -> tuple[Flat, dict[str, Any]]:
+        info["subtasks_done"] = len(info["episode_task_completions"])
+        info["success"] = info["subtasks_done"] == len(self.task.subtasks)
+        return super()._outside(observation, info)
+
+    def flatten(self, observation: Any) -> Any:
+        """Robot positions (9), object positions (21), goal (30)."""
+        return np.concatenate([kitchen_layout(observation["observation"]), goal_vector(self.task.subtasks)], axis=-1)

@@ -1,0 +1,223 @@
+"""What a task is: one environment, one start and one goal, and how its scores and rewards are read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dds_lightning.errors import UserError
+
+Cell = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Task:
+    """One row of the task table.
+
+    A body may be simulated in more than one way: D4RL's AntMaze files were recorded with other torques and
+    another time step than gymnasium-robotics has. Such a row has `variants`: `NAME` is the physics that the
+    published scores belong to, `NAME@VARIANT` another one. A variant is a task like any other; it never
+    changes the widths of observations and actions.
+
+    Attributes:
+        name: What a user types, for example `pointmaze-large-diverse` or `hopper-medium@v5`.
+        family: Tasks of one family share observations, actions and recipes.
+        env_id: Gymnasium's name of the environment.
+        observation_dim: O, the width of the flat observation. In mazes it never holds the goal: one task has
+            one goal.
+        observation_layout: Which numbers stand where in an observation, in words.
+        action_dim: A.
+        action_low: Lower bound of every action entry.
+        action_high: Upper bound of every action entry.
+        max_episode_steps: Steps after which an evaluation episode is truncated.
+        step_seconds: Simulated seconds a step.
+        env_options: More arguments of the environment's constructor.
+        adapter: How the environment's observations become flat ones: "flat" takes them as they are, "maze"
+            and "kitchen" read gymnasium-robotics' dictionaries.
+        physics: Name of this variant; "" where there is only one.
+        variants: Name of a physics -> the attributes that differ; this row's own `physics` is among them,
+            with no difference.
+        maze_map: Rows of the maze, "1" wall and "0" free; None where there is no maze.
+        cell_size: Side of a cell in metres.
+        origin: Where (0, 0) lies: in the maze's "centre" with y up (gymnasium-robotics), or in the middle of
+            the "start" cell with y growing down the map (D4RL).
+        start_cell: (row, column) where evaluation episodes start.
+        goal_cell: (row, column) of the one goal.
+        goal_radius: Distance to the goal in metres that counts as success.
+        goal_noise: Mean distance in metres, on both axes, of evaluation goals from the goal cell's centre.
+            D4RL's AntMaze draws each episode's goal from a one-sided range; elsewhere this is 0.
+        subtasks: In the kitchen, what has to be done.
+        measures_success: Whether an episode can succeed; a runner only scores.
+        data_reward: What the learner's rewards are made from: "environment", as recorded; "goal", 1 where the
+            step reaches the task's goal; "subtasks", the number of subtasks that are done in the state
+            reached, at every step, as D4RL's kitchen files have it.
+        reward_scale: The learner's reward is `reward_scale * (reward + reward_shift)`; scores never use it.
+        reward_shift: See `reward_scale`.
+        score_min: Return of the environment's own rewards that scores 0.
+        score_max: Return that scores 100.
+        evaluation_episodes: Episodes behind a published score.
+        data_ids: Source -> name of the data set in that source.
+        data_env_ids: Environments whose recordings fit this task (same body, same walls); `env_id` always
+            does.
+        data_start_cells: Cells where collected episodes start; None means every free cell.
+        data_goal_cells: Cells that collected episodes head for; None means every free cell.
+        paper_score: Normalised score that the paper reports in its table 1, if it does.
+    """
+
+    name: str
+    family: str
+    env_id: str
+    observation_dim: int
+    action_dim: int
+    max_episode_steps: int
+    step_seconds: float
+    observation_layout: str = ""
+    action_low: float = -1.0
+    action_high: float = 1.0
+    env_options: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    adapter: Literal["flat", "maze", "kitchen"] = "flat"
+    physics: str = ""
+    variants: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, hash=False, repr=False)
+    maze_map: tuple[str, ...] | None = None
+    cell_size: float = 1.0
+    origin: Literal["centre", "start"] = "centre"
+    start_cell: Cell | None = None
+    goal_cell: Cell | None = None
+    goal_radius: float = 0.45
+    goal_noise: float = 0.0
+    subtasks: tuple[str, ...] = ()
+    measures_success: bool = True
+    data_reward: Literal["environment", "goal", "subtasks"] = "environment"
+    reward_scale: float = 1.0
+    reward_shift: float = 0.0
+    score_min: float = 0.0
+    score_max: float = 1.0
+    evaluation_episodes: int = 100
+    data_ids: Mapping[str, str] = field(default_factory=dict, hash=False)
+    data_env_ids: tuple[str, ...] = ()
+    data_start_cells: tuple[Cell, ...] | None = None
+    data_goal_cells: tuple[Cell, ...] | None = None
+    paper_score: float | None = None
+
+    # ------------------------------------------------------------------ variants
+
+    def variant(self, physics: str) -> Task:
+        """The same task in another physics, named `NAME@PHYSICS`.
+
+        Raises:
+            UserError: When this task has no such physics.
+        """
+        if physics not in self.variants:
+            known = ", ".join(f"{self.base_name}@{name}" for name in self.variants) or "no variants"
+            raise UserError(f"task: '{self.base_name}' has no physics '{physics}'; it has {known}")
+        changes = {"physics": physics, **self.variants[physics]}
+        return replace(self, name=f"{self.base_name}@{physics}", **changes)
+
+    @property
+    def base_name(self) -> str:
+        """The name without `@VARIANT`."""
+        return self.name.partition("@")[0]
+
+    @property
+    def is_pinned(self) -> bool:
+        """Whether the name says which physics is meant; otherwise the data may choose."""
+        return "@" in self.name
+
+    def accepts(self, env_id: str) -> bool:
+        """Whether recordings of an environment fit this task as it is."""
+        return env_id == self.env_id or env_id in self.data_env_ids
+
+    # ------------------------------------------------------------------ geometry
+
+    def free_cells(self) -> tuple[Cell, ...]:
+        """Every free (row, column) of the maze, row by row."""
+        rows = self._maze()
+        return tuple((i, j) for i, row in enumerate(rows) for j, value in enumerate(row) if value == "0")
+
+    def cell_to_xy(self, cell: ArrayLike) -> NDArray[np.float64]:
+        """Centre of a cell in the environment's coordinates, see `origin`.
+
+        Args:
+            cell: (..., 2) row and column.
+
+        Returns:
+            (..., 2) x and y in metres.
+        """
+        row0, column0, down = self._frame()
+        cell = np.asarray(cell, dtype=np.float64)
+        x = (cell[..., 1] - column0) * self.cell_size
+        y = (cell[..., 0] - row0) * down * self.cell_size
+        return np.stack([x, y], axis=-1)
+
+    def xy_to_cell(self, xy: ArrayLike) -> NDArray[np.int64]:
+        """The cell that holds a position; the inverse of `cell_to_xy`.
+
+        Args:
+            xy: (..., 2) x and y in metres.
+
+        Returns:
+            (..., 2) row and column; outside the maze the numbers run on past its edges.
+        """
+        row0, column0, down = self._frame()
+        xy = np.asarray(xy, dtype=np.float64)
+        i = np.floor(down * xy[..., 1] / self.cell_size + row0 + 0.5)
+        j = np.floor(xy[..., 0] / self.cell_size + column0 + 0.5)
+        return np.stack([i, j], axis=-1).astype(np.int64)
+
+    def start_xy(self) -> NDArray[np.float64]:
+        """Centre of the start cell, (2,)."""
+        if self.start_cell is None:
+            raise UserError(f"task '{self.name}' has no start cell: only mazes have one")
+        return self.cell_to_xy(self.start_cell)
+
+    def goal_xy(self) -> NDArray[np.float64]:
+        """The goal, (2,): the goal cell's centre, or the mean of the goals that episodes draw around it."""
+        if self.goal_cell is None:
+            raise UserError(f"task '{self.name}' has no goal cell: only mazes have one")
+        return self.cell_to_xy(self.goal_cell) + self.goal_noise
+
+    def _frame(self) -> tuple[float, float, int]:
+        """Row and column (with fractions) of the origin, and the sign of y down the map."""
+        rows = self._maze()
+        if self.origin == "centre":
+            return (len(rows) - 1) / 2, (len(rows[0]) - 1) / 2, -1
+        assert self.start_cell is not None, "a frame at the start cell needs one"
+        return float(self.start_cell[0]), float(self.start_cell[1]), 1
+
+    def _maze(self) -> tuple[str, ...]:
+        if self.maze_map is None:
+            raise UserError(f"task '{self.name}' has no maze: cells mean nothing there")
+        return self.maze_map
+
+    # ------------------------------------------------------------------ scores
+
+    def normalised_score(self, returns: ArrayLike) -> NDArray[np.float64]:
+        """D4RL's normalised score, 0 to 100: `100 * (return - score_min) / (score_max - score_min)`.
+
+        Args:
+            returns: Sums of the environment's own rewards.
+        """
+        returns = np.asarray(returns, dtype=np.float64)
+        return 100.0 * (returns - self.score_min) / (self.score_max - self.score_min)
+
+    # ------------------------------------------------------------------ environments
+
+    def make_env(self, render_mode: str | None = None) -> gym.Env[NDArray[np.float32], NDArray[np.float32]]:
+        """The evaluation environment: flat float32 observations, this task's start and goal at every reset.
+
+        In mazes the body starts in `start_cell` with the environment's own noise, and reaching the goal ends
+        the episode. The goal is exactly the centre of `goal_cell`, except where `goal_noise` says that it
+        moves. `info` holds `success` (bool) after every reset and step, in mazes `position` (2,), in the
+        kitchen `subtasks_done` (int).
+
+        Args:
+            render_mode: Gymnasium's render mode, for example "rgb_array".
+        """
+        from dds_lightning.envs.adapters import make_task_env  # gymnasium is slow to import
+
+        return make_task_env(self, render_mode)
