@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from datamodules.collect.planner import planner_for
+from datamodules.collect.waypoints import Waypoints
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import Task
 
@@ -78,27 +78,18 @@ class Driver:
             speed: Cruising speed in metres a second; the environment stops at 5 on each axis.
             gain: Action for one metre a second of velocity error.
         """
-        maze = task._maze()
-        self.planner = planner_for(maze)
-        self.rows, self.columns, self.size = len(maze), len(maze[0]), task.cell_size
+        self.waypoints = Waypoints(task)
         self.speed, self.gain = speed, gain
-        cells = np.array([divmod(i, self.columns) for i in range(self.rows * self.columns)])
-        self._centres: list[list[float]] = task.cell_to_xy(cells).tolist()
-        self._next: list[list[int]] = self.planner.next_cell.tolist()
         self.start_episode(np.random.default_rng(0), 1, QUIET)
 
     def start_episode(self, rng: np.random.Generator, steps: int, noise: BehaviourNoise) -> None:
         """Draw an episode's noise: action noise, bursts, waypoint offsets; after `steps` it repeats."""
         self._noise = (noise.action_noise * rng.standard_normal((steps, 2))).tolist()
         self._burst = _bursts(rng, steps, noise)
-        self._offsets = (rng.uniform(-noise.waypoint_offset, noise.waypoint_offset, (steps, 2)) * self.size).tolist()
-        self._step, self._cell, self._goal = 0, -1, -1
-        self._target = [0.0, 0.0]
-
-    def _index(self, x: float, y: float) -> int:
-        row = math.floor(self.rows / 2 - y / self.size)
-        column = math.floor(x / self.size + self.columns / 2)
-        return min(max(row, 0), self.rows - 1) * self.columns + min(max(column, 0), self.columns - 1)
+        offsets = rng.uniform(-noise.waypoint_offset, noise.waypoint_offset, (steps, 2)) * self.waypoints.size
+        self._offsets = list(map(tuple, offsets.tolist()))
+        self._step = 0
+        self.waypoints.forget()
 
     def act(self, x: float, y: float, vx: float, vy: float, goal: tuple[float, float]) -> tuple[float, float]:
         """The force for this step, in the box."""
@@ -109,12 +100,7 @@ class Driver:
             return min(max(-self.gain * vx, -1.0), 1.0), min(max(-self.gain * vy, -1.0), 1.0)
         if burst is not None:
             return burst
-        cell, aim = self._index(x, y), self._index(*goal)
-        if cell != self._cell or aim != self._goal:
-            self._cell, self._goal = cell, aim
-            centre, offset = self._centres[self._next[aim][cell]], self._offsets[step]
-            self._target = [centre[0] + offset[0], centre[1] + offset[1]]
-        target_x, target_y = goal if cell == aim else self._target
+        target_x, target_y = self.waypoints.target(x, y, goal, self._offsets[step])
         dx, dy = target_x - x, target_y - y
         scale = self.speed / (math.hypot(dx, dy) + 1e-6)
         noise = self._noise[step]

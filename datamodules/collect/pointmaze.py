@@ -3,13 +3,6 @@
 from __future__ import annotations
 
 import copy
-import multiprocessing
-import os
-import signal
-import sys
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from importlib import metadata as installed
 from pathlib import Path
 from typing import Any
@@ -21,12 +14,11 @@ from numpy.typing import NDArray
 
 from datamodules.collect.behaviour import QUIET, BehaviourNoise, Driver
 from datamodules.collect.minari_writer import write_minari
+from datamodules.collect.recording import Episode, record
 from datamodules.storage import refuse_existing
 from dds_lightning.envs.build import build_env, register_environments
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import Task, get_task
-
-_EPISODES_A_PARCEL = 4  # what a worker fetches at once; has no influence on the data
 
 
 def collect_pointmaze(
@@ -85,8 +77,6 @@ def collect_pointmaze(
     for name, value in (("steps", steps), ("episode_steps", episode_steps)):
         if value < 1:
             raise UserError(f"{name}: found {value}, expected at least 1")
-    if workers is not None and workers < 1:
-        raise UserError(f"workers: found {workers}, expected at least 1, or none for every core")
     if seed < 0:
         raise UserError(f"seed: found {seed}, expected at least 0")
     if not 0 < speed <= 5:
@@ -103,13 +93,12 @@ def collect_pointmaze(
     refuse_existing(Path(out) / name, overwrite)
 
     recorder = _Recorder(task, seed, steps, episode_steps, speed, noise)
-    workers = min(workers or _cores(), -(-recorder.episodes // _EPISODES_A_PARCEL))
-    episodes = _in_parallel(recorder, workers) if workers > 1 else map(recorder, range(recorder.episodes))
+    episodes = record(recorder, workers, title=f"collecting {name}" if progress else None)
     env = recorder.env()
     return write_minari(
         out,
         name,
-        _with_progress(episodes, steps, f"collecting {name}") if progress else episodes,
+        episodes,
         env_spec=collection_spec(task, episode_steps),
         observation_space=env.observation_space,
         action_space=env.action_space,
@@ -159,14 +148,14 @@ def _spec(task: Task, cap: int, options: dict[str, Any]) -> EnvSpec:
 
 
 class _Recorder:
-    """Records episode i of a data set; everything about it follows from (seed, i)."""
+    """Records round i of a data set, one episode; everything about it follows from (seed, i)."""
 
     def __init__(
         self, task: Task, seed: int, steps: int, episode_steps: int, speed: float, noise: BehaviourNoise
     ) -> None:
         self.task, self.seed, self.steps, self.episode_steps = task, seed, steps, episode_steps
         self.noise, self.driver = noise, Driver(task, speed=speed)
-        self.episodes = -(-steps // episode_steps)
+        self.rounds = -(-steps // episode_steps)
         self._env: gym.Env[Any, Any] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -177,7 +166,7 @@ class _Recorder:
             self._env = build_env(collection_spec(self.task, self.episode_steps))
         return self._env
 
-    def __call__(self, number: int) -> dict[str, Any]:
+    def __call__(self, number: int) -> list[Episode]:
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number,)))
         length = min(self.episode_steps, self.steps - number * self.episode_steps)
         env, driver = self.env(), self.driver
@@ -206,7 +195,7 @@ class _Recorder:
             if rewards[t] > 0:
                 goal = tuple(maze.goal.tolist())  # the environment has drawn a new one
         truncations[-1] = True  # the clock, or the end of the data set
-        return {
+        episode = {
             "observations": {
                 "observation": observations, "achieved_goal": observations[:, :2], "desired_goal": goals
             },
@@ -216,6 +205,7 @@ class _Recorder:
             "truncations": truncations,
             "infos": {"success": success},
         }  # fmt: skip
+        return [episode]
 
     def _anywhere_in_cell(self, maze: Any, rng: np.random.Generator) -> NDArray[np.float64]:
         """Move the body from where the environment put it to anywhere in that cell, at rest."""
@@ -224,55 +214,6 @@ class _Recorder:
         xy = self.task.cell_to_xy(cell) + offset
         maze.point_env.set_state(xy, np.zeros(2))
         return np.concatenate([xy, np.zeros(2)])
-
-    def parcel(self, first: int) -> list[dict[str, Any]]:
-        return [self(i) for i in range(first, min(first + _EPISODES_A_PARCEL, self.episodes))]
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _in_parallel(recorder: _Recorder, workers: int) -> Iterator[dict[str, Any]]:
-    # No fork: a parent that runs deep-learning threads must not be copied.
-    method = "spawn" if sys.platform in ("win32", "darwin") else "forkserver"
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context(method), _keep, (recorder,))
-    try:
-        for parcel in pool.map(_record, range(0, recorder.episodes, _EPISODES_A_PARCEL)):
-            yield from parcel
-    except (BrokenProcessPool, ConnectionError, EOFError) as error:
-        raise UserError(
-            "workers: a collecting process died; a script must call this under `if __name__ == '__main__':`, "
-            "and workers=1 needs no other processes"
-        ) from error
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-_kept: _Recorder | None = None
-
-
-def _keep(recorder: _Recorder) -> None:
-    global _kept
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
-    _kept = recorder
-
-
-def _record(first: int) -> list[dict[str, Any]]:
-    assert _kept is not None
-    return _kept.parcel(first)
-
-
-def _with_progress(episodes: Iterator[dict[str, Any]], steps: int, title: str) -> Iterator[dict[str, Any]]:
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("steps"))
-    with Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True)) as bar:
-        work = bar.add_task(title, total=steps)
-        for episode in episodes:
-            yield episode
-            bar.advance(work, len(episode["rewards"]))
 
 
 def _description(task: Task, seed: int, speed: float, noise: BehaviourNoise) -> str:

@@ -161,17 +161,32 @@ class DiffusionDecoder(nn.Module):
             (B, A), in [-1, 1] when ``clip`` is set.
         """
         size = (len(observations), self.action_dim)
-        device = observations.device
+        drawn = [torch.randn(size, device=observations.device, generator=generator) for _ in range(self.draws)]
+        return self.denoise(noise_scale * torch.stack(drawn), observations, skills)
 
-        def draw() -> Tensor:
-            return noise_scale * torch.randn(size, device=device, generator=generator)
+    @property
+    def draws(self) -> int:
+        """Gaussians that one action takes: the first, and for ``ddpm`` one after every step but the last."""
+        return self.diffusion_steps if self.sampler == "ddpm" else 1
 
-        x = draw()
+    def denoise(self, noise: Tensor, observations: Tensor, skills: Tensor) -> Tensor:
+        """`sample` with given noise: a function of its arguments.
+
+        Args:
+            noise: (`draws`, B, A), the noise scale included.
+            observations: (B, O) normalised.
+            skills: (B, D).
+
+        Returns:
+            (B, A).
+        """
+        draws = iter(noise)
+        x = next(draws)
         for i in reversed(range(self.diffusion_steps)):
-            t = torch.full((size[0],), i, device=device)
-            noise = self.predict_noise(x, t, observations, skills)
+            t = torch.full((x.shape[0],), i, device=x.device)  # `len` would fix the batch when exporting
+            predicted = self.predict_noise(x, t, observations, skills)
             alpha_bar = self.alpha_bars[i]
-            x0 = (x - (1.0 - alpha_bar).sqrt() * noise) / alpha_bar.sqrt()
+            x0 = (x - (1.0 - alpha_bar).sqrt() * predicted) / alpha_bar.sqrt()
             if self.clip:
                 x0 = x0.clamp(-1.0, 1.0)
             if i == 0:
@@ -179,13 +194,13 @@ class DiffusionDecoder(nn.Module):
             previous = self.alpha_bars[i - 1]
             if self.sampler == "ddim":
                 # The noise that leads to the clipped x0, so that the path ends there.
-                noise = (x - alpha_bar.sqrt() * x0) / (1.0 - alpha_bar).sqrt()
-                x = previous.sqrt() * x0 + (1.0 - previous).sqrt() * noise
+                predicted = (x - alpha_bar.sqrt() * x0) / (1.0 - alpha_bar).sqrt()
+                x = previous.sqrt() * x0 + (1.0 - previous).sqrt() * predicted
                 continue
             beta = self.betas[i]
             mean = (previous.sqrt() * beta * x0 + (1.0 - beta).sqrt() * (1.0 - previous) * x) / (1.0 - alpha_bar)
             variance = beta * (1.0 - previous) / (1.0 - alpha_bar)
-            x = mean + variance.sqrt() * draw()
+            x = mean + variance.sqrt() * next(draws)
         raise AssertionError("unreachable: the loop returns at i = 0")
 
 
@@ -227,3 +242,9 @@ class MLPDecoder(nn.Module):
         """Predict actions (B, A); there is no noise to scale or draw."""
         del noise_scale, generator
         return self.net(torch.cat([skills, observations], dim=-1)).tanh()
+
+    draws = 0
+
+    def denoise(self, noise: Tensor, observations: Tensor, skills: Tensor) -> Tensor:
+        """As `sample`; ``noise`` (0, B, A) is empty."""
+        return self.sample(observations, skills)

@@ -1,0 +1,289 @@
+"""AntMaze data by D4RL's recipe: a planner over cells, a trained Ant that walks where it is told, noise on purpose."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from importlib import metadata as installed
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from datamodules.behaviours.ant import AntController
+from datamodules.collect.minari_writer import write_minari
+from datamodules.collect.recording import Episode, Kept, record
+from datamodules.collect.waypoints import Waypoints
+from datamodules.storage import refuse_existing
+from dds_lightning.envs.build import build_env
+from dds_lightning.errors import UserError
+from dds_lightning.tasks import Cell, Task, get_task
+
+FLIPPED_STEPS = 25
+"""An ant that lies on its back this long has fallen for good (it takes a few steps to roll over a leg)."""
+
+
+@dataclass(frozen=True)
+class AntMazeRecipe:
+    """How the data are made; the defaults are D4RL's (`generate_ant_maze_datasets.py`).
+
+    Attributes:
+        action_noise: Standard deviation of the Gaussian noise on every action entry.
+        waypoint_noise: Waypoints lie up to this many metres beyond a cell's centre, on both axes, to one side.
+        episode_steps: Steps after which an episode is truncated.
+        end_when_flipped: End an episode (truncation) when the ant has lain on its back for `FLIPPED_STEPS`;
+            D4RL's episodes run on.
+    """
+
+    action_noise: float = 0.2
+    waypoint_noise: float = 1.0
+    episode_steps: int = 1000
+    end_when_flipped: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse what makes no sense."""
+        if not 0.0 <= self.action_noise < math.inf:
+            raise UserError(f"action_noise: found {self.action_noise}, expected a number of at least 0")
+        if not 0.0 <= self.waypoint_noise <= 1.5:
+            raise UserError(f"waypoint_noise: found {self.waypoint_noise}, expected 0 to 1.5 metres")
+        if self.episode_steps < 1:
+            raise UserError(f"episode_steps: found {self.episode_steps}, expected at least 1")
+
+
+def collect_antmaze(
+    task: Task | str,
+    steps: int = 1_000_000,
+    seed: int = 0,
+    out: str | Path = "data",
+    workers: int | None = None,
+    *,
+    recipe: AntMazeRecipe | None = None,
+    dataset_id: str | None = None,
+    overwrite: bool = False,
+    progress: bool = True,
+) -> Path:
+    """Collect an AntMaze data set in D4RL's physics and write it as a Minari data set.
+
+    Episodes of 1,000 steps: the ant walks to a goal, and when it is there to a new one. `diverse` tasks start
+    and head anywhere, `play` tasks start anywhere and head for hand-picked cells, `antmaze-umaze` always goes
+    from the start to the goal. Rewards are those of the evaluation goal, drawn anew for every episode as the
+    evaluation draws it: 1 where a step leads to within 0.5 m of it. An interrupted call goes on where it
+    stopped when it is made again.
+
+    Args:
+        task: An AntMaze task (in D4RL's physics) or its name.
+        steps: Environment steps in all.
+        seed: Same seed, same bytes of every array, whatever the workers and interruptions.
+        out: Folder of data sets; the set becomes `out/<dataset_id>`, where MINARI_DATASETS_PATH=out finds it.
+        workers: Processes; None takes every core, 1 stays in this process.
+        recipe: What the behaviour does.
+        dataset_id: Name of the set; None takes the task's own, for example "antmaze-large-diverse-v0".
+        overwrite: Replace a set of the same name.
+        progress: Show a progress bar on standard error.
+
+    Returns:
+        The data set's folder; `load_trajectories(f"local:{folder}", task)` reads it.
+
+    Raises:
+        UserError: For a task that is no AntMaze in D4RL's physics, a number out of range, or a folder that
+            exists.
+    """
+    task = get_task(task) if isinstance(task, str) else task
+    recipe = recipe or AntMazeRecipe()
+    if task.family != "antmaze" or task.physics != "d4rl":
+        raise UserError(f"task: '{task.name}' is no AntMaze in D4RL's physics, and this collector knows only those")
+    if steps < 1:
+        raise UserError(f"steps: found {steps}, expected at least 1")
+    if seed < 0:
+        raise UserError(f"seed: found {seed}, expected at least 0")
+    name = dataset_id or task.data_ids["local"]
+    folder = Path(out) / name
+    refuse_existing(folder, overwrite)
+    recorder = _Recorder(task, seed, steps, recipe)
+    made_from = {
+        "task": task.name,
+        "seed": seed,
+        "steps": steps,
+        **asdict(recipe),
+        "controller": recorder.controller.fingerprint,
+    }
+    kept = Kept(folder, made_from)
+    kept.open()
+    env = recorder.env()
+    assert env.spec is not None, "made by its id"
+    write_minari(
+        out,
+        name,
+        record(recorder, workers, kept=kept, title=f"collecting {name}" if progress else None),
+        env_spec=env.spec,
+        observation_space=gym.spaces.Box(-np.inf, np.inf, (task.observation_dim,), np.float32),
+        action_space=env.action_space,
+        overwrite=overwrite,
+        metadata={
+            "author": ["dds-lightning"],
+            "algorithm_name": "shortest path over cells, heading-conditioned Ant controller",
+            "description": _description(task, seed, recipe),
+            "requirements": [f"{p}=={installed.version(p)}" for p in ("gymnasium", "mujoco")],
+            "collection": made_from,
+        },
+    )
+    kept.remove()
+    return folder
+
+
+class _Recorder:
+    """Records round i of a data set, `episode_steps` steps; everything about it follows from (seed, i)."""
+
+    def __init__(self, task: Task, seed: int, steps: int, recipe: AntMazeRecipe) -> None:
+        self.task, self.seed, self.steps, self.recipe = task, seed, steps, recipe
+        self.rounds = -(-steps // recipe.episode_steps)
+        self.controller = AntController.load()
+        self.waypoints = Waypoints(task)
+        # With one goal there is nowhere else to go: the episode ends there, as in D4RL's `antmaze-umaze`.
+        self.ends_at_goal = len(task.data_goal_cells or ()) == 1
+        self._env: gym.Env[Any, Any] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_env": None}  # each process makes its own
+
+    def env(self) -> gym.Env[Any, Any]:
+        if self._env is None:
+            self._env = build_env(self.task.env_id, max_episode_steps=self.recipe.episode_steps)
+        return self._env
+
+    def __call__(self, number: int) -> list[Episode]:
+        rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number,)))
+        left = min(self.recipe.episode_steps, self.steps - number * self.recipe.episode_steps)
+        episodes: list[Episode] = []
+        while left:
+            episodes.append(self._episode(rng, left))
+            left -= len(episodes[-1]["rewards"])
+        return episodes
+
+    def _episode(self, rng: np.random.Generator, length: int) -> Episode:
+        """At most `length` steps."""
+        task, recipe = self.task, self.recipe
+        env: Any = self.env().unwrapped
+        env.reset(seed=int(rng.integers(2**31)))
+        evaluation_goal = env.goal.copy()
+        state = self._placed(env, _draw(rng, task.data_start_cells or task.free_cells()))
+        noise = recipe.action_noise * rng.standard_normal((length, task.action_dim))
+        offsets = (rng.uniform(0.0, 1.0, (length, 2)) * recipe.waypoint_noise).tolist()
+
+        observations = np.empty((length + 1, task.observation_dim), np.float32)
+        actions = np.empty((length, task.action_dim), np.float32)
+        goals = np.empty((length + 1, 2), np.float32)
+        self.waypoints.forget()
+        goal = self._new_goal(rng, state)
+        observations[0], goals[0] = state, goal
+        on_back = 0
+        for t in range(length):
+            actions[t] = np.clip(self._action(state, goal, offsets[t]) + noise[t], -1.0, 1.0)
+            state = env.step(actions[t])[0]
+            observations[t + 1], goals[t + 1] = state, goal
+            there = math.hypot(state[0] - goal[0], state[1] - goal[1]) <= task.goal_radius
+            if there and not self.ends_at_goal:
+                goals[t + 1] = goal = self._new_goal(rng, state)
+            # The body's z axis in the world, from the quaternion (w, x, y, z).
+            on_back = on_back + 1 if 1.0 - 2.0 * (state[4] ** 2 + state[5] ** 2) < 0.0 else 0
+            if (there and self.ends_at_goal) or (recipe.end_when_flipped and on_back >= FLIPPED_STEPS):
+                length = t + 1
+                break
+        near = np.linalg.norm(observations[1 : length + 1, :2] - evaluation_goal, axis=1) <= task.goal_radius
+        return {
+            "observations": observations[: length + 1],
+            "actions": actions[:length],
+            "rewards": near.astype(np.float32),
+            "terminations": np.zeros(length, bool),
+            "truncations": np.arange(length) == length - 1,
+            "infos": {"goal": goals[: length + 1], "evaluation_goal": np.tile(evaluation_goal, (length + 1, 1))},
+        }
+
+    def _action(self, state: NDArray[np.float64], goal: tuple[float, float], offset: list[float]) -> Any:
+        x, y = float(state[0]), float(state[1])
+        target_x, target_y = self.waypoints.target(x, y, goal, (offset[0], offset[1]))
+        return self.controller.act(state[None], np.array([math.atan2(target_y - y, target_x - x)]))[0]
+
+    def _placed(self, env: Any, cell: Cell) -> NDArray[np.float64]:
+        """Move the body from the start cell to another, with the noise that the reset gave it."""
+        qpos = env.data.qpos.copy()
+        qpos[:2] += self.task.cell_to_xy(cell)  # the start cell is the origin
+        env.set_state(qpos, env.data.qvel.copy())
+        return np.concatenate([env.data.qpos[:15], env.data.qvel[:14]])
+
+    def _new_goal(self, rng: np.random.Generator, state: NDArray[np.float64]) -> tuple[float, float]:
+        """A goal in another cell than the body's, with the evaluation's noise."""
+        task = self.task
+        here = task.xy_to_cell(state[:2])
+        cells = task.data_goal_cells or task.free_cells()
+        elsewhere = [cell for cell in cells if self.ends_at_goal or tuple(here) != cell]
+        noise = rng.uniform(0.0, 1.0, 2) + rng.uniform(0.0, 0.5, 2)
+        x, y = (task.cell_to_xy(_draw(rng, elsewhere)) + noise).tolist()
+        return x, y
+
+
+def _draw(rng: np.random.Generator, cells: Any) -> Cell:
+    return cells[int(rng.integers(len(cells)))]
+
+
+def _description(task: Task, seed: int, recipe: AntMazeRecipe) -> str:
+    return (
+        f"An ant walks through {task.env_id} with D4RL's physics; a new goal follows each one reached. A planner over "
+        f"the maze's cells gives waypoints (up to {recipe.waypoint_noise} m beyond a cell's centre), a trained "
+        f"controller walks towards them with action noise {recipe.action_noise}. Rewards are those of the evaluation "
+        f"goal, drawn once an episode. Seed {seed}."
+    )
+
+
+class AntNavigator:
+    """The behaviour as an actor: walks every ant of a batch to the task's goal cell, and about in it.
+
+    `codes` is None: this actor chooses no skills.
+    """
+
+    def __init__(self, task: Task | str, recipe: AntMazeRecipe | None = None) -> None:
+        """Prepare for `task`; without a recipe the controller is at its best, without noise on actions."""
+        self.task = get_task(task) if isinstance(task, str) else task
+        self.recipe = recipe or AntMazeRecipe(action_noise=0.0)
+        self.controller = AntController.load()
+        self.codes: NDArray[np.int64] | None = None
+        self.reset()
+
+    def reset(self, num_envs: int = 1, seed: int | None = None) -> None:
+        """Forget everything and prepare for `num_envs` environments; `seed` fixes the noise."""
+        self._rng = np.random.default_rng(seed)
+        self._ways = [Waypoints(self.task) for _ in range(num_envs)]
+        self._goals = [self._goal() for _ in range(num_envs)]
+
+    def _goal(self) -> tuple[float, float]:
+        """Somewhere among the evaluation's goals, which an actor is not shown."""
+        assert self.task.goal_cell is not None
+        noise = self._rng.uniform(0.0, 1.0, 2) + self._rng.uniform(0.0, 0.5, 2)
+        x, y = (self.task.cell_to_xy(self.task.goal_cell) + noise).tolist()
+        return x, y
+
+    def act(self, observations: NDArray[np.float32], restarted: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
+        """Actions for a batch.
+
+        Args:
+            observations: (E, 29).
+            restarted: (E,) True where an episode has just begun.
+
+        Returns:
+            (E, 8) in the box.
+        """
+        headings = np.empty(len(observations))
+        offsets = (self._rng.uniform(0.0, 1.0, (len(observations), 2)) * self.recipe.waypoint_noise).tolist()
+        for e, (x, y) in enumerate(observations[:, :2].tolist()):
+            if restarted is not None and restarted[e]:
+                self._ways[e].forget()
+            if math.hypot(x - self._goals[e][0], y - self._goals[e][1]) <= self.task.goal_radius:
+                self._goals[e] = self._goal()
+            offset_x, offset_y = offsets[e]
+            target_x, target_y = self._ways[e].target(x, y, self._goals[e], (offset_x, offset_y))
+            headings[e] = math.atan2(target_y - y, target_x - x)
+        actions = self.controller.act(observations, headings)
+        noise = self.recipe.action_noise * self._rng.standard_normal(actions.shape)
+        return np.clip(actions + noise, -1.0, 1.0).astype(np.float32)
