@@ -243,6 +243,27 @@ class DDSAgent(nn.Module):
 
     # ---------------------------------------------------------------- files
 
+    @torch.inference_mode()
+    def golden(self) -> dict[str, list[list[float]]]:
+        """What the networks answer to fixed questions, kept with published weights to recognise them by.
+
+        Returns:
+            `actions` (8, A) for fixed states, codes and noise, and, with a policy, its `logits` (8, K; 0 where the
+            data have no support). Six digits: other processors round differently.
+        """
+        rows = 8
+        wave = torch.arange(rows * self.observation_dim, device=self.device).reshape(rows, -1).float().sin()
+        skill = self.skill.eval()
+        observations = skill.normaliser.mean + skill.normaliser.std * wave  # (8, O), as the data are spread
+        codes = torch.arange(rows, device=self.device) % self.num_skills
+        count = skill.decoder.draws * rows * self.action_dim
+        noise = torch.arange(count, device=self.device).reshape(-1, rows, self.action_dim).float().cos()
+        unit = skill.decoder.denoise(noise, skill.normaliser(observations), skill.bottleneck.lookup(codes))
+        answers = {"actions": skill.action_box.from_unit(unit)}
+        if self.policy is not None:
+            answers["logits"] = self.policy.eval().logits(observations).nan_to_num(neginf=0.0)
+        return {name: [[round(x, 6) for x in row] for row in answer.tolist()] for name, answer in answers.items()}
+
     def save(
         self,
         directory: str | Path,
@@ -273,23 +294,25 @@ class DDSAgent(nn.Module):
         acting: dict[str, Any] = {"selection": self.selection, "temperature": self.temperature}
         acting["noise_scale"] = self.noise_scale
         acting["fixed_codes"] = None if self.fixed_codes is None else self.fixed_codes.tolist()
-        return publish(directory, modules, {**about, "agent": acting}, metrics, card)
+        return publish(directory, modules, {**about, "agent": acting, "golden": self.golden()}, metrics, card)
 
     @classmethod
     def load(cls, directory: str | Path, **settings: Any) -> Self:
         """Load a published agent, without its data set, on the CPU.
 
         Args:
-            directory: as written by `save` or `dds run`.
+            directory: as written by `save` or `dds run`, or `hf:OWNER/NAME` on the hub.
             **settings: override `selection`, `temperature`, `noise_scale`, `fixed_codes`, `seed`.
 
         Raises:
             UserError: files are missing, changed, of a newer version, or do not fit; the message names them.
         """
         from dds_lightning.checkpointing import load_published
+        from dds_lightning.hub import is_hub, pull
         from dds_lightning.policy import PolicyModule
         from dds_lightning.skill import SkillModule
 
+        directory = pull(str(directory)) if is_hub(directory) else directory
         published = load_published(directory)
         skill = published.module(SkillModule, "skill")
         policy = published.module(PolicyModule, "policy") if "policy" in published.config else None
