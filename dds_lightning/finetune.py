@@ -102,6 +102,18 @@ class StageModule(pl.LightningModule):
             getattr(self, name).eval()
         return self
 
+    def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
+        """One optimiser step and what belongs to it.
+
+        Not in `on_train_batch_end`: callbacks come before the module there, and a checkpoint that one of them
+        writes would lack what follows the step.
+        """
+        super().optimizer_step(*args, **kwargs)
+        self.after_step(self.global_step + 1)  # Lightning counts the step when this returns
+
+    def after_step(self, step: int) -> None:
+        """Follow up on optimiser step `step`, counted from 1."""
+
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """A training that goes on does not start from anything."""
         self.init_from = None

@@ -323,7 +323,7 @@ class PolicyModule(StageModule):
             )
 
     @torch.no_grad()
-    def on_train_batch_end(self, outputs: Any, batch: dict[str, Tensor], batch_idx: int) -> None:
+    def after_step(self, step: int) -> None:
         """Move the target critic towards the critic."""
         target: list[Tensor] = list(self.target_critic.parameters())
         online: list[Tensor] = list(self.critic.parameters())

@@ -284,6 +284,7 @@ class SkillModule(StageModule):
 
     def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """One optimiser step's loss."""
+        self._batch = batch
         total, self.terms, _ = self.loss(batch)
         if is_log_step(self):
             log = {"loss": total.detach(), **self.terms}
@@ -293,16 +294,16 @@ class SkillModule(StageModule):
             self.log_dict({f"train/{name}": value for name, value in log.items()})
         return total
 
-    def on_train_batch_end(self, outputs: Any, batch: dict[str, Tensor], batch_idx: int) -> None:
+    def after_step(self, step: int) -> None:
         """Restart dead codes from this batch, until the codebook has to settle."""
-        h, step = self.hparams, self.global_step
+        h = self.hparams
         if h.restart_threshold <= 0 or step % h.restart_every or "codebook" not in self.trained_parts:
             return
         settled = self.trainer.max_steps > 0 and step > h.restart_until * self.trainer.max_steps
         if settled or not isinstance(self.bottleneck, Codebook):
             return
         generator = torch.Generator().manual_seed(step)
-        moved = self.bottleneck.restart_dead(self._encodings([batch]), h.restart_threshold, generator)
+        moved = self.bottleneck.restart_dead(self._encodings([self._batch]), h.restart_threshold, generator)
         optimizer: Any = self.optimizers()
         state = optimizer.state.get(self.bottleneck.vectors, {})
         for name in ("exp_avg", "exp_avg_sq"):  # the moments belonged to the code that died

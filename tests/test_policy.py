@@ -198,7 +198,7 @@ def test_target_critic_follows_at_the_polyak_rate():
         for p in module.critic.parameters():
             p.add_(1.0)
     before = [p.clone() for p in module.target_critic.parameters()]
-    module.on_train_batch_end(None, {}, 0)
+    module.after_step(1)
     for b, t, c in zip(before, module.target_critic.parameters(), module.critic.parameters(), strict=True):
         torch.testing.assert_close(t, 0.75 * b + 0.25 * c)
 
