@@ -5,6 +5,7 @@ import warnings
 import lightning.pytorch as pl
 import pytest
 import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
 from torch.utils.data import DataLoader
 
 from dds_lightning.errors import UserError
@@ -201,6 +202,24 @@ def test_target_critic_follows_at_the_polyak_rate():
     module.after_step(1)
     for b, t, c in zip(before, module.target_critic.parameters(), module.critic.parameters(), strict=True):
         torch.testing.assert_close(t, 0.75 * b + 0.25 * c)
+
+
+def test_a_checkpoint_in_the_middle_of_a_run_holds_the_last_move_of_the_target(tmp_path):
+    """Callbacks come before the module at a batch's end: what the module did there was missing in checkpoints."""
+
+    def fit(steps, callbacks):
+        module = small(observation_dim=5, lr=1e-2, target_ema=0.5)
+        pl.Trainer(
+            max_steps=steps, logger=False, accelerator="cpu", enable_checkpointing=bool(callbacks),
+            enable_progress_bar=False, enable_model_summary=False, callbacks=callbacks,
+        ).fit(module, Chain())  # fmt: skip
+        return module.state_dict()
+
+    every = ModelCheckpoint(tmp_path, "{step}", save_top_k=-1, every_n_train_steps=3, save_on_train_epoch_end=False)
+    fit(5, [every])
+    saved = torch.load(tmp_path / "step=3.ckpt", weights_only=True)["state_dict"]
+    for name, value in fit(3, []).items():
+        assert torch.equal(value, saved[name]), name
 
 
 def test_the_watch_warns_of_values_that_no_rewards_can_sum_to():
