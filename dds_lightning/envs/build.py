@@ -17,10 +17,26 @@ _BUILD_LOCK = threading.Lock()
 
 def register_environments() -> None:
     """Make gymnasium-robotics' environments and ours known to Gymnasium; slow the first time, so done late."""
+    from dds_lightning.tasks.rows import ROWS  # what an environment is, its row says
+
     with _BUILD_LOCK, contextlib.redirect_stderr(io.StringIO()):  # it prints a notice on others
         import gymnasium_robotics
 
         gym.register_envs(gymnasium_robotics)
+        for task in ROWS:
+            if task.env_id.startswith("dds/AntMazeD4RL_") and task.env_id not in gym.registry:
+                gym.register(
+                    task.env_id,
+                    entry_point="dds_lightning.envs.antmaze:D4RLAntMazeEnv",
+                    max_episode_steps=task.max_episode_steps,
+                    kwargs={
+                        "maze_map": task.maze_map,
+                        "start_cell": task.start_cell,
+                        "goal_cell": task.goal_cell,
+                        "cell_size": task.cell_size,
+                        "goal_radius": task.goal_radius,
+                    },
+                )
 
 
 def build_env(env_id: str | EnvSpec, **kwargs: Any) -> gym.Env[Any, Any]:

@@ -1,4 +1,8 @@
-"""What every figure over a maze is made of: walls, paths, the start's star, the number of a skill."""
+"""What every figure over a maze is made of: walls, paths, the start's star, the number of a skill.
+
+A maze is seen from above with y up, as the simulator has it: a left turn is a left turn. Where y grows down the map
+(D4RL's AntMaze) the map's first row is therefore the lowest.
+"""
 
 from collections.abc import Iterable
 from functools import partial
@@ -8,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PatchCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.patches import Polygon, Rectangle
 from numpy.typing import NDArray
 
 from dds_lightning.errors import UserError
@@ -21,7 +25,9 @@ LABEL, TICKS, NUMBER = 12.0, 11.0, 9.0
 
 
 def draw_walls(ax: Axes, task: Task, goal: bool = True) -> None:
-    """Draw the maze, one square a wall cell, with axes in metres and the goal's circle.
+    """Draw the maze, one square a wall cell, with axes in metres and where the goal counts as reached.
+
+    That is a circle, or, where every episode draws its goal, all the circles there can be.
 
     Raises:
         UserError: the task has no maze.
@@ -42,19 +48,28 @@ def draw_walls(ax: Axes, task: Task, goal: bool = True) -> None:
     ax.set_ylabel("y (m)", fontsize=LABEL)
     ax.tick_params(labelsize=TICKS)
     if goal:
-        centre = tuple(task.goal_xy())
-        ax.add_patch(Circle(centre, task.goal_radius, facecolor=GOAL, alpha=0.10, zorder=1))
-        ax.add_patch(Circle(centre, task.goal_radius, fill=False, edgecolor=GOAL, linewidth=1.2, zorder=5))
+        outline = goal_outline(task)
+        ax.add_patch(Polygon(outline, facecolor=GOAL, edgecolor="none", alpha=0.10, zorder=1))
+        ax.add_patch(Polygon(outline, fill=False, edgecolor=GOAL, linewidth=1.2, zorder=5))
+
+
+def goal_outline(task: Task, points: int = 120) -> NDArray[np.float64]:
+    """The edge (P, 2) in metres of all places within the goal's radius of a goal.
+
+    A circle round the one goal, a square with round corners where goals are drawn from a square.
+    """
+    angles = (np.arange(points) + 0.5) * 2 * np.pi / points
+    outwards = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    return task.goal_xy() + task.goal_noise * np.sign(outwards) + task.goal_radius * outwards
 
 
 def extent(task: Task) -> tuple[tuple[float, float], tuple[float, float]]:
     """Left and right, bottom and top of a maze in metres."""
     assert task.maze_map is not None
+    corners = task.cell_to_xy([(0, 0), (len(task.maze_map) - 1, len(task.maze_map[0]) - 1)])
+    (left, bottom), (right, top) = corners.min(axis=0), corners.max(axis=0)
     half = task.cell_size / 2
-    last = (len(task.maze_map) - 1, len(task.maze_map[0]) - 1)
-    left, bottom = task.cell_to_xy((last[0], 0)) - half
-    right, top = task.cell_to_xy((0, last[1])) + half
-    return (float(left), float(right)), (float(bottom), float(top))
+    return (float(left - half), float(right + half)), (float(bottom - half), float(top + half))
 
 
 def zoom(ax: Axes, task: Task, centre: NDArray[Any], reach: float) -> None:
@@ -67,8 +82,15 @@ def zoom(ax: Axes, task: Task, centre: NDArray[Any], reach: float) -> None:
     ax.set(xlim=windows[0], ylim=windows[1])
 
 
-def draw_path(ax: Axes, path: RolloutPath, numbers: bool = False, linewidth: float = 1.0) -> None:
-    """Draw one path coloured by the skill in use; with ``numbers`` write each code where it takes over."""
+def draw_path(ax: Axes, path: RolloutPath, linewidth: float = 1.0, numbers: float = 0.0) -> None:
+    """Draw one path coloured by the skill in use.
+
+    Args:
+        ax: a maze.
+        path: positions and codes.
+        linewidth: in points.
+        numbers: write each code where it takes over if that is this far (metres) from every other; 0 for none.
+    """
     positions, codes = np.asarray(path.positions), np.asarray(path.codes)
     pieces = np.stack([positions[:-1], positions[1:]], axis=1)  # (T, 2, 2)
     colours = [skill_colour(int(code)) for code in codes]
@@ -77,7 +99,7 @@ def draw_path(ax: Axes, path: RolloutPath, numbers: bool = False, linewidth: flo
     if numbers:
         written = positions[:1]  # the star is there; numbers on top of each other or of it tell nothing
         for t in np.flatnonzero(np.diff(codes, prepend=codes[0] - 1)):
-            if np.linalg.norm(positions[t] - written, axis=1).min() >= 0.5:
+            if np.linalg.norm(positions[t] - written, axis=1).min() >= numbers:
                 written = np.concatenate([written, positions[t : t + 1]])
                 draw_number(ax, positions[t], int(codes[t]))
 

@@ -115,7 +115,7 @@ def plot_trajectories(task: Task, result: RolloutResult, actor: str, episodes: i
     ax = figure.add_subplot()
     draw_walls(ax, task)
     for index, (_, path) in reversed(list(enumerate(rows))):  # those with numbers come last, on top
-        draw_path(ax, path, numbers=index < numbered, linewidth=1.6)
+        draw_path(ax, path, linewidth=1.6, numbers=0.5 * task.cell_size if index < numbered else 0.0)
     draw_starts(ax, [path.positions[0] for _, path in rows], task.cell_size, size=16)
     table = _rows_of(result, actor)
     share = f"{table['success'].mean():.0%} of {len(table)} episodes reach the goal ({len(rows)} drawn)"
@@ -245,9 +245,9 @@ def plot_failures(task: Task, result: RolloutResult, actor: str) -> Figure:
     ends, codes = shown[["final_x", "final_y"]].to_numpy(), shown["final_code"].to_numpy()
     colours = [skill_colour(int(code)) for code in codes]
     ax.scatter(ends[:, 0], ends[:, 1], s=30, c=colours, edgecolors="white", linewidths=0.4, zorder=3)
-    written = np.empty((0, 2))
+    written, room = np.empty((0, 2)), 0.3 * task.cell_size  # a number needs that much
     for end, code in zip(ends, codes, strict=True):
-        if code >= 0 and np.all(np.linalg.norm(end - written, axis=1) >= 0.3):  # there is room for a number
+        if code >= 0 and np.all(np.linalg.norm(end - written, axis=1) >= room):
             written = np.concatenate([written, end[None]])
             draw_number(ax, end, int(code), size=8)
     cells, counts = np.unique(task.xy_to_cell(ends), axis=0, return_counts=True)
@@ -279,7 +279,7 @@ def plot_value_map(
 
     Args:
         task: the maze.
-        value: observations (N, O) to V (N,); position first, every other entry 0.
+        value: observations (N, O) to V (N,); position first, then the body as it starts an episode.
         codes: observations (N, O) to codes (N,), asked at cell centres.
         directions: (K, 2) mean displacement of each code in metres, for the arrows.
         resolution: points a cell on each axis.
@@ -320,9 +320,11 @@ def plot_value_map(
 
 
 def _at_rest(task: Task, points: NDArray[Any]) -> NDArray[np.float32]:
-    """Observations (N, O) of a body at rest at positions (N, 2)."""
+    """Observations (N, O) of a body at rest at positions (N, 2), an ant upright as its episodes begin."""
     observations = np.zeros((len(points), task.observation_dim), np.float32)
     observations[:, :2] = points
+    if task.family == "antmaze":
+        observations[:, 2:4] = 0.75, 1.0  # height, and w of the quaternion
     return observations
 
 

@@ -58,34 +58,22 @@ def known_env_ids() -> frozenset[str]:
 
 
 def task_table() -> pd.DataFrame:
-    """The table of tasks for people: one row a task."""
+    """The table of tasks for people: one row a task; `facts.task_facts` has everything about one."""
     import pandas as pd
 
     return pd.DataFrame(
         [
             {
+                "family": task.family,
+                "variants": ", ".join(f"@{name}" for name in task.variants if name != task.physics),
                 "task": task.name,
                 "environment": task.env_id,
-                "variants": ", ".join(f"@{name}" for name in task.variants if name != task.physics),
-                "observations": task.observation_dim,
-                "actions": task.action_dim,
-                "start": task.start_cell,
-                "goal": task.goal_cell,
+                "O/A": f"{task.observation_dim}/{task.action_dim}",
                 "steps": task.max_episode_steps,
                 "episodes": task.evaluation_episodes,
-                "learning reward": _reward(task),
-                "score 0": task.score_min,
-                "score 100": task.score_max,
+                "score range": f"{task.score_min:.4g} to {task.score_max:g}",
                 "paper": math.nan if task.paper_score is None else task.paper_score,
-                "data": ", ".join(f"{source}:{name}" for source, name in task.data_ids.items()),
-                "observation": task.observation_layout,
             }
             for task in ROWS
         ]
     )
-
-
-def _reward(task: Task) -> str:
-    r = {"environment": "r", "goal": "goal", "subtasks": "done"}[task.data_reward]
-    inner = f"({r} {task.reward_shift:+g})" if task.reward_shift else r
-    return inner if task.reward_scale == 1 else f"{task.reward_scale:g} {inner}"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from dds_lightning.tasks.task import Cell, Task
@@ -24,6 +26,13 @@ _KINDS = ("", "_Diverse_G", "_Diverse_GR")
 """gymnasium-robotics' names of one maze with different goals and starts."""
 
 
+def _with_variants(task: Task, **others: Mapping[str, Any]) -> Task:
+    """Give a row its variants: physics -> the attributes that differ from the row's."""
+    differ = dict.fromkeys(name for changes in others.values() for name in changes)
+    own = {name: getattr(task, name) for name in differ}
+    return replace(task, variants={task.physics: own, **{name: {**own, **changes} for name, changes in others.items()}})
+
+
 # ---------------------------------------------------------------------- locomotion
 
 
@@ -44,29 +53,31 @@ def _locomotion() -> tuple[Task, ...]:
         "walker2d": "z, pitch, 6 joint angles, then velocities of x, z, pitch and the 6 joints, cut to +-10",
     }
     return tuple(
-        Task(
-            name=f"{name}-{quality}",
-            family="locomotion",
-            env_id=f"{camel}-v4",
-            observation_dim=observations,
-            observation_layout=layouts[name],
-            action_dim=actions,
-            max_episode_steps=1000,
-            step_seconds=seconds,
-            physics="v4",
-            variants={"v4": {}, "v5": {"env_id": f"{camel}-v5", "data_env_ids": ()}},
-            measures_success=False,
-            reward_scale=round(300 / highest, 3),
-            score_min=lowest,
-            score_max=highest,
-            evaluation_episodes=20,
-            data_ids={
-                "local": f"{name}-{quality}-v0",
-                "d4rl": f"{name}_{quality.replace('-', '_')}-v2.hdf5",
-                **({"minari": f"mujoco/{name}/medium-v0"} if quality == "medium" else {}),
-            },
-            data_env_ids=(f"{camel}-v2", f"{camel}-v3"),
-            paper_score=score,
+        _with_variants(
+            Task(
+                name=f"{name}-{quality}",
+                family="locomotion",
+                env_id=f"{camel}-v4",
+                observation_dim=observations,
+                observation_layout=layouts[name],
+                action_dim=actions,
+                max_episode_steps=1000,
+                step_seconds=seconds,
+                physics="v4",
+                measures_success=False,
+                reward_scale=round(300 / highest, 3),
+                score_min=lowest,
+                score_max=highest,
+                evaluation_episodes=20,
+                data_ids={
+                    "local": f"{name}-{quality}-v0",
+                    "d4rl": f"{name}_{quality.replace('-', '_')}-v2.hdf5",
+                    **({"minari": f"mujoco/{name}/medium-v0"} if quality == "medium" else {}),
+                },
+                data_env_ids=(f"{camel}-v2", f"{camel}-v3"),
+                paper_score=score,
+            ),
+            v5={"env_id": f"{camel}-v5", "data_env_ids": ()},
         )
         for name, camel, observations, actions, seconds, lowest, highest, scores in bodies
         for quality, score in zip(("medium", "medium-replay", "medium-expert"), scores, strict=True)
@@ -101,7 +112,7 @@ def _antmaze(
         name = f"antmaze-{size}{f'-{recipe}' if recipe else ''}"
         many = recipe == "diverse" or (size == "umaze" and recipe != "")
         start = "False" if name == "antmaze-umaze" else "True"
-        return Task(
+        task = Task(
             name=name,
             family="antmaze",
             env_id=f"dds/AntMazeD4RL_{camel}-v0",
@@ -112,19 +123,6 @@ def _antmaze(
             max_episode_steps=cap,
             step_seconds=0.1,
             physics="d4rl",
-            variants={
-                "d4rl": {},
-                "robotics": {
-                    "env_id": f"AntMaze_{camel}-v4",
-                    "adapter": "maze",
-                    "step_seconds": 0.05,
-                    "origin": "centre",
-                    "goal_radius": 0.45,
-                    "goal_noise": 0.0,
-                    "data_env_ids": robotics,
-                    "data_reward": "goal",
-                },
-            },
             maze_map=maze_map,
             cell_size=4.0,
             origin="start",
@@ -132,6 +130,7 @@ def _antmaze(
             goal_cell=goal,
             goal_radius=0.5,
             goal_noise=0.75,  # the mean of U(0, 1) + U(0, 0.5)
+            data_reward="arrival",
             reward_scale=0.1,
             reward_shift=-1.0,
             data_ids={
@@ -142,6 +141,19 @@ def _antmaze(
             data_start_cells=((1, 1),) if name == "antmaze-umaze" else None,
             data_goal_cells=(goal,) if name == "antmaze-umaze" else goals if recipe == "play" else None,
             paper_score=scores[recipe],
+        )
+        return _with_variants(
+            task,
+            robotics={
+                "env_id": f"AntMaze_{camel}-v4",
+                "adapter": "maze",
+                "step_seconds": 0.05,
+                "origin": "centre",
+                "goal_radius": 0.45,
+                "goal_noise": 0.0,
+                "data_env_ids": robotics,
+                "data_reward": "goal",
+            },
         )
 
     return tuple(row(recipe) for recipe in scores)

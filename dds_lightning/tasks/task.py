@@ -40,8 +40,8 @@ class Task:
         adapter: How the environment's observations become flat ones: "flat" takes them as they are, "maze"
             and "kitchen" read gymnasium-robotics' dictionaries.
         physics: Name of this variant; "" where there is only one.
-        variants: Name of a physics -> the attributes that differ; this row's own `physics` is among them,
-            with no difference.
+        variants: Name of a physics -> its values of the attributes in which the physics differ; this row's own
+            `physics` is among them.
         maze_map: Rows of the maze, "1" wall and "0" free; None where there is no maze.
         cell_size: Side of a cell in metres.
         origin: Where (0, 0) lies: in the maze's "centre" with y up (gymnasium-robotics), or in the middle of
@@ -54,7 +54,8 @@ class Task:
         subtasks: In the kitchen, what has to be done.
         measures_success: Whether an episode can succeed; a runner only scores.
         data_reward: What the learner's rewards are made from: "environment", as recorded; "goal", 1 where the
-            step reaches the task's goal; "subtasks", the number of subtasks that are done in the state
+            step reaches the task's goal; "arrival", the same where the recording says so, because its goal is one
+            of many; "subtasks", the number of subtasks that are done in the state
             reached, at every step, as D4RL's kitchen files have it.
         reward_scale: The learner's reward is `reward_scale * (reward + reward_shift)`; scores never use it.
         reward_shift: See `reward_scale`.
@@ -92,7 +93,7 @@ class Task:
     goal_noise: float = 0.0
     subtasks: tuple[str, ...] = ()
     measures_success: bool = True
-    data_reward: Literal["environment", "goal", "subtasks"] = "environment"
+    data_reward: Literal["environment", "goal", "arrival", "subtasks"] = "environment"
     reward_scale: float = 1.0
     reward_shift: float = 0.0
     score_min: float = 0.0

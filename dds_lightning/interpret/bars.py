@@ -1,0 +1,44 @@
+"""Scores as bars, for tasks that have no maze to draw."""
+
+import textwrap
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from dds_lightning.interpret.drawing import LABEL, TICKS
+from dds_lightning.interpret.palette import NO_SKILL, SKILL_COLOURS
+
+WRAP = 34
+"""Letters of a contestant's name on one line."""
+
+
+def plot_scores(summary: pd.DataFrame) -> Figure:
+    """Normalised score of every contestant and of every single skill, with its standard error.
+
+    Args:
+        summary: columns `contestant`, `kind` ("skill" for a single skill's row), `score`, `score_error`.
+    """
+    rows = summary.iloc[::-1]  # bars are drawn from below
+    names = [textwrap.fill(str(name), WRAP) for name in rows["contestant"]]
+    colours = [NO_SKILL if kind == "skill" else SKILL_COLOURS[0] for kind in rows["kind"]]
+    lines = sum(name.count("\n") + 1 for name in names)
+    figure = Figure(figsize=(7.0, 0.8 + 0.24 * lines), layout="constrained")
+    ax = figure.add_subplot()
+    errors = rows["score_error"].fillna(0.0)
+    ax.barh(range(len(rows)), rows["score"], xerr=errors, color=colours, height=0.7, ecolor="black", capsize=2)
+    for place, score, error in zip(range(len(rows)), rows["score"], errors, strict=True):
+        ax.annotate(
+            f"{score:.1f}",
+            (max(score + error, 0.0), place),
+            xytext=(4, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=8,
+        )
+    ax.set_yticks(range(len(rows)), names, fontsize=8)
+    ax.axvline(0.0, color="black", linewidth=0.8)
+    ax.margins(x=0.1, y=0.01)
+    ax.tick_params(axis="x", labelsize=TICKS)
+    ax.set_xlabel("normalised score, ± standard error", fontsize=LABEL)
+    ax.spines[["top", "right"]].set_visible(False)
+    return figure
