@@ -57,8 +57,8 @@ def validate_episode(
     arrays = {name: _array(where, name, fields[name]) for name in FIELDS}
     _check_shapes(where, arrays, observation_dim, len(action_low))
     for name in ("observations", "actions", "rewards"):
-        arrays[name] = _finite(where, name, arrays[name])
-    arrays["actions"] = _in_box(where, arrays["actions"], action_low, action_high)
+        arrays[name] = finite(f"{where}, {name}", arrays[name])
+    arrays["actions"] = in_box(f"{where}, actions", arrays["actions"], action_low, action_high)
     _check_ends(where, arrays)
     return arrays
 
@@ -101,26 +101,55 @@ def _check_shapes(where: str, arrays: dict[str, NDArray[Any]], observations: int
         raise DataError(f"{where}, observations: found {seen} rows, expected {steps + 1} (T + 1){missing}")
 
 
-def _finite(where: str, name: str, array: NDArray[Any]) -> NDArray[np.float32]:
+def finite(where: str, array: NDArray[Any], *, first: int = 0, unit: str = "step") -> NDArray[np.float32]:
+    """Numbers as float32.
+
+    Args:
+        where: Data set, episode and field, as messages begin.
+        array: (N,) or (N, columns).
+        first: Number of the first row, where `array` is a part of something longer.
+        unit: What messages call a row.
+
+    Raises:
+        DataError: For numbers that are not finite, or too large for 32 bits.
+    """
     with np.errstate(over="ignore"):
         single = array.astype(np.float32)
     bad = np.argwhere(~np.isfinite(single))
     if len(bad):
         index = tuple(int(i) for i in bad[0])
-        value = array[index]
-        place = f"step {index[0]}" + (f", column {index[1]}" if len(index) > 1 else "")
-        raise DataError(f"{where}, {name}: found {value} at {place}, expected finite 32-bit numbers")
+        place = f"{unit} {first + index[0]}" + (f", column {index[1]}" if len(index) > 1 else "")
+        raise DataError(f"{where}: found {array[index]} at {place}, expected finite 32-bit numbers")
     return single
 
 
-def _in_box(
-    where: str, actions: NDArray[np.float32], low: NDArray[np.float32], high: NDArray[np.float32]
+def in_box(
+    where: str,
+    actions: NDArray[np.float32],
+    low: NDArray[np.float32],
+    high: NDArray[np.float32],
+    *,
+    first: int = 0,
+    unit: str = "step",
 ) -> NDArray[np.float32]:
+    """Actions clipped into their box, which they may leave by `BOX_TOLERANCE`.
+
+    Args:
+        where: As for `finite`, likewise `first` and `unit`.
+        actions: (N, A).
+        low: (A,).
+        high: (A,).
+        first: See `finite`.
+        unit: See `finite`.
+
+    Raises:
+        DataError: For actions further outside.
+    """
     outside = np.argwhere((actions < low - BOX_TOLERANCE) | (actions > high + BOX_TOLERANCE))
     if len(outside):
         t, j = (int(i) for i in outside[0])
         raise DataError(
-            f"{where}, actions: found {actions[t, j]:g} at step {t}, column {j}, expected {low[j]:g} to {high[j]:g}"
+            f"{where}: found {actions[t, j]:g} at {unit} {first + t}, column {j}, expected {low[j]:g} to {high[j]:g}"
         )
     return np.clip(actions, low, high)
 

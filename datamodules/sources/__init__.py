@@ -1,4 +1,4 @@
-"""Where trajectories come from: `local:DIR`, `minari:ID`, `arrays:DIR`; a new source is one more entry."""
+"""Where trajectories come from: `d4rl:FILE`, `minari:ID`, `local:DIR`, `arrays:DIR`; a new source is one more entry."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 from datamodules.sources.arrays import load_arrays
-from datamodules.sources.goal import relabel_to_goal
+from datamodules.sources.d4rl import load_d4rl
+from datamodules.sources.goal import cut_at_arrivals, relabel_to_goal
 from datamodules.sources.minari import load_local, load_minari_id, local_env_id, minari_env_id
+from datamodules.sources.subtasks import relabel_subtasks
 from datamodules.trajectories import DataError, Trajectories
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import Task, get_task, task_for_env
@@ -30,6 +32,7 @@ SOURCES: dict[str, Source] = {
     "local": Source(load_local, local_env_id),
     "minari": Source(load_minari_id, minari_env_id),
     "arrays": Source(load_arrays, lambda directory: None),
+    "d4rl": Source(load_d4rl, lambda file: None),
 }
 
 
@@ -70,28 +73,30 @@ def load_trajectories(
     spec: str,
     task: Task | str | None = None,
     *,
-    reward: Literal["evaluation_goal", "recorded"] = "evaluation_goal",
+    reward: Literal["task", "recorded"] = "task",
 ) -> Trajectories:
     """Read and check a data set.
 
     Args:
         spec: `local:DIR`, a folder with one Minari data set; `minari:ID`, a data set under
-            MINARI_DATASETS_PATH or ~/.minari/datasets; `arrays:DIR`, what `Trajectories.save` wrote.
+            MINARI_DATASETS_PATH or ~/.minari/datasets; `d4rl:FILE`, a file of D4RL's, by path or by name;
+            `arrays:DIR`, what `Trajectories.save` wrote.
         task: The task that the data must fit; None only checks that they are sound, and keeps recorded
             rewards.
-        reward: In mazes, "evaluation_goal" gives the reward of the task's one goal (`relabel_to_goal`),
-            whatever goals the recording had; "recorded" keeps what the environment gave. Other tasks keep
-            theirs.
+        reward: "task" gives what the task's `data_reward` names: in mazes the reward of its one goal
+            (`relabel_to_goal`) or of the recording's (`cut_at_arrivals`), in the kitchen the number of subtasks
+            done (`relabel_subtasks`), elsewhere what was recorded. "recorded" keeps that everywhere.
 
     Raises:
         UserError: For an unknown source.
         DataError: For data that are damaged, incomplete or another task's.
     """
-    if reward not in ("evaluation_goal", "recorded"):
-        raise UserError(f"reward: found '{reward}', expected 'evaluation_goal' or 'recorded'")
+    if reward not in ("task", "recorded"):
+        raise UserError(f"reward: found '{reward}', expected 'task' or 'recorded'")
     source, rest = _parse(spec)
     task = resolve_task(spec, task) if task is not None else None
     trajectories = source.load(rest, task)
-    if task is not None and task.data_reward == "goal" and reward == "evaluation_goal":
-        trajectories = relabel_to_goal(trajectories, task)
-    return trajectories
+    if task is None or reward == "recorded" or task.data_reward == "environment":
+        return trajectories
+    relabel = {"goal": relabel_to_goal, "arrival": cut_at_arrivals, "subtasks": relabel_subtasks}[task.data_reward]
+    return relabel(trajectories, task)

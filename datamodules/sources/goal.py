@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.trajectories import DataError, Trajectories
+from datamodules.windows import ranges
 from dds_lightning.tasks import Task
 
 
@@ -15,13 +14,8 @@ def relabel_to_goal(trajectories: Trajectories, task: Task) -> Trajectories:
     """Give every step the reward of the task's own goal, and end episodes where it is reached.
 
     `r_t = 1` if the position after step t lies within `goal_radius` of the goal, else 0. Reaching the goal
-    ends the episode (termination). What follows is a new episode, which begins with the first state outside:
-    nobody acts from a state where the task has ended, and standing on the goal is never paid twice.
-
-        outside outside INSIDE inside inside outside outside
-        └── terminated ──────┘ └─ left out ┘ └─ new episode ...
-
-    Terminations of other goals become truncations: for this task nothing ended there.
+    ends the episode (termination); what follows begins anew outside, see `cut_at_goal`. Terminations of other
+    goals become truncations: for this task nothing ended there.
 
     Args:
         trajectories: Positions are the first two columns of the observations.
@@ -31,43 +25,91 @@ def relabel_to_goal(trajectories: Trajectories, task: Task) -> Trajectories:
         DataError: When every recorded state lies on the goal, so that nothing is left.
     """
     inside = np.linalg.norm(trajectories.observations[:, :2] - task.goal_xy(), axis=1) <= task.goal_radius
-    pieces: list[dict[str, Any]] = []
-    for number in range(trajectories.num_episodes):
-        episode = trajectories.episode(number)
-        rows = slice(*trajectories.observation_offsets[number : number + 2])
-        for first, last, reached in _pieces(inside[rows]):
-            steps = last - first
-            end = np.arange(steps) == steps - 1
-            pieces.append(
-                {
-                    "observations": episode["observations"][first : last + 1],
-                    "actions": episode["actions"][first:last],
-                    "rewards": (end & reached).astype(np.float32),
-                    "terminations": end & reached,
-                    "truncations": end & (not reached),
-                }
-            )
-    if not pieces:
-        raise DataError(f"data set '{trajectories.name}': every state lies on the goal of task '{task.name}'")
+    return _cut(trajectories, inside)
+
+
+def cut_at_arrivals(trajectories: Trajectories, task: Task) -> Trajectories:
+    """End episodes where the recording was rewarded for reaching its goal; what follows begins anew outside.
+
+    For data whose goal lies somewhere else in every recording (D4RL's AntMaze draws it): the rewards say where.
+
+    Args:
+        trajectories: Rewards are 1 where a step leads to the goal, else 0.
+        task: A maze task.
+
+    Raises:
+        DataError: When rewards are others, or every recorded state lies on the goal.
+    """
+    odd = trajectories.rewards[(trajectories.rewards != 0) & (trajectories.rewards != 1)]
+    if len(odd):
+        raise DataError(
+            f"data set '{trajectories.name}', rewards: found {odd[0]:g}, expected 0 or 1 (on the goal) for task "
+            f"'{task.name}'"
+        )
+    inside = np.zeros(len(trajectories.observations), bool)
+    steps = np.flatnonzero(trajectories.rewards == 1)
+    inside[steps + trajectories.episode_of(steps) + 1] = True
+    return _cut(trajectories, inside)
+
+
+def _cut(trajectories: Trajectories, inside: NDArray[np.bool_]) -> Trajectories:
+    """Episodes that end where `inside` (N + E,) begins, rewarded there."""
+    first, last, reached = cut_at_goal(inside, trajectories.lengths + 1)
+    if not len(first):
+        raise DataError(f"data set '{trajectories.name}': every recorded state lies on the goal, so nothing is left")
+    lengths = last - first
+    # State row s + e belongs to step s of episode e.
+    episodes = np.searchsorted(trajectories.observation_offsets, first, side="right") - 1
+    terminations, truncations = ends_of(lengths, reached)
     return Trajectories(
         name=trajectories.name,
-        lengths=np.array([len(piece["rewards"]) for piece in pieces], np.int64),
+        observations=trajectories.observations[ranges(first, lengths + 1)],
+        actions=trajectories.actions[ranges(first - episodes, lengths)],
+        rewards=terminations.astype(np.float32),
+        terminations=terminations,
+        truncations=truncations,
+        lengths=lengths,
         action_low=trajectories.action_low,
         action_high=trajectories.action_high,
-        **{key: np.concatenate([piece[key] for piece in pieces]) for key in pieces[0]},
     )
 
 
-def _pieces(inside: NDArray[np.bool_]) -> list[tuple[int, int, bool]]:
-    """Cut one episode: (first state, last state, whether the last is the goal) of each part."""
-    parts: list[tuple[int, int, bool]] = []
-    first, final = 0, len(inside) - 1
-    while True:
-        away = np.flatnonzero(~inside[first:])
-        if not len(away) or first + away[0] >= final:
-            return parts
-        first += int(away[0])
-        arrivals = np.flatnonzero(inside[first:])
-        last = first + int(arrivals[0]) if len(arrivals) else final
-        parts.append((first, last, bool(len(arrivals))))
-        first = last
+def cut_at_goal(
+    inside: NDArray[np.bool_], lengths: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Cut recorded episodes into those that end where the goal is first reached.
+
+    What follows an arrival is a new episode, which begins with the first state outside: nobody acts from a
+    state where the task has ended, and standing on the goal is never paid twice.
+
+        outside outside INSIDE inside inside outside outside
+        └── terminated ──────┘ └─ left out ┘ └─ new episode ...
+
+    Args:
+        inside: (S,) whether each state lies on the goal, episode after episode.
+        lengths: (E,) states of each recorded episode, at least 1; they add up to S.
+
+    Returns:
+        First state, last state and whether that is the goal, of each new episode of at least one step.
+    """
+    final = np.zeros(len(inside), bool)
+    final[np.cumsum(lengths) - 1] = True
+    away = ~inside
+    follows = np.zeros(len(inside), bool)  # whether the state before is outside too, in the same episode
+    follows[1:] = away[:-1] & ~final[:-1]
+    leads = np.append(follows[1:] & away[1:], False)
+    first, last = np.flatnonzero(away & ~follows), np.flatnonzero(away & ~leads)
+    reached = ~final[last]
+    last = last + reached
+    whole = last > first
+    return first[whole], last[whole], reached[whole]
+
+
+def ends_of(lengths: NDArray[np.int64], terminated: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Terminations and truncations, (N,) each, of episodes of `lengths` (E,), of which some `terminated` (E,)."""
+    last = np.cumsum(lengths) - 1
+    terminations = np.zeros(int(lengths.sum()), bool)
+    truncations = terminations.copy()
+    terminations[last] = terminated
+    truncations[last] = ~terminated
+    return terminations, truncations

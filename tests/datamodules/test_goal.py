@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules.sources.goal import relabel_to_goal
+from datamodules.sources.goal import cut_at_arrivals, relabel_to_goal
 from datamodules.trajectories import DataError, Trajectories
 from dds_lightning.tasks import get_task
 
@@ -71,5 +71,25 @@ def test_relabelling_twice_changes_nothing() -> None:
 
 
 def test_nothing_but_goal_is_an_error() -> None:
-    with pytest.raises(DataError, match="every state lies on the goal of task 'pointmaze-large-diverse'"):
+    with pytest.raises(DataError, match="every recorded state lies on the goal"):
         relabel_to_goal(Trajectories.from_episodes("walk", [_walk("IIII")]), TASK)
+
+
+def _paid(places: str) -> dict[str, Any]:
+    """The same walk, rewarded by the recording for every state on its goal."""
+    paid = np.array([place == "I" for place in places[1:]], float)
+    return {**_walk(places), "rewards": paid}
+
+
+@pytest.mark.parametrize("places", ["OOOO", "OOI", "OOIIOOO", "OIOI", "OIIII", "OOIO", "OIIOOIOO"])
+def test_recorded_arrivals_cut_as_the_goal_itself_does(places: str) -> None:
+    data = Trajectories.from_episodes("walk", [_paid("OOIO"), _paid(places)])
+    by_reward, by_place = cut_at_arrivals(data, TASK), relabel_to_goal(data, TASK)
+    assert by_reward.fingerprint() == by_place.fingerprint()
+    assert cut_at_arrivals(by_reward, TASK).fingerprint() == by_reward.fingerprint()
+
+
+def test_rewards_that_do_not_say_where_the_goal_is_are_refused() -> None:
+    data = Trajectories.from_episodes("walk", [_walk("OOI")])
+    with pytest.raises(DataError, match=r"'walk', rewards: found 0.5, expected 0 or 1 \(on the goal\) for task"):
+        cut_at_arrivals(data, TASK)

@@ -1,0 +1,69 @@
+"""Tells by its numbers whether a recording can be of a task at all: D4RL's files do not say what they are of."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datamodules.validation import DataError
+from dds_lightning.envs.kitchen import goal_vector
+from dds_lightning.tasks import Task
+
+IN_WALLS = 0.05
+"""Share of positions that may lie in walls: none do, but maps may be drawn with a margin."""
+
+HEIGHTS = {"walker2d": (0.8, 2.0), "halfcheetah": (-1.0, 0.8)}
+"""Heights of two bodies whose observations and actions have the same widths: a walker below 0.8 m has fallen."""
+
+SAMPLE = 100_000
+"""Rows that are looked at."""
+
+
+def refuse_other_task(where: str, observations: NDArray[np.float32], task: Task) -> None:
+    """Refuse observations that no recording of `task` can hold.
+
+    Args:
+        where: The data set, as messages begin.
+        observations: (N, O), the widths are right already.
+        task: In mazes positions must lie in its corridors, in the kitchen the goal columns must hold its
+            subtasks, and bodies of the same widths are told apart by their height.
+
+    Raises:
+        DataError: For the data of another task.
+    """
+    rows = observations[:: max(1, len(observations) // SAMPLE)]
+    if task.maze_map is not None:
+        _refuse_other_maze(where, rows, task)
+    if task.family == "kitchen":
+        _refuse_other_subtasks(where, rows, task)
+    low, high = HEIGHTS.get(task.base_name.partition("-")[0], (-np.inf, np.inf))
+    height = float(np.median(rows[:, 0]))
+    if not low <= height <= high:
+        raise DataError(
+            f"{where}, observations: the body's median height is {height:.3g} m, but in task '{task.name}' it lies "
+            f"between {low:g} and {high:g}; the data are of another body"
+        )
+
+
+def _refuse_other_maze(where: str, rows: NDArray[np.float32], task: Task) -> None:
+    walls = np.array([[value == "1" for value in row] for row in task.maze_map or ()])
+    cells = task.xy_to_cell(rows[:, :2])
+    outside = ((cells < 0) | (cells >= walls.shape)).any(axis=1)
+    i, j = np.clip(cells, 0, np.array(walls.shape) - 1).T
+    share = float((outside | walls[i, j]).mean())
+    if share > IN_WALLS:
+        raise DataError(
+            f"{where}, observations: {share:.0%} of the positions lie outside the corridors of task '{task.name}'; "
+            "the data are of another maze, or of another physics with other coordinates"
+        )
+
+
+def _refuse_other_subtasks(where: str, rows: NDArray[np.float32], task: Task) -> None:
+    expected = goal_vector(task.subtasks)
+    odd = np.argwhere(np.abs(rows[:, 30:] - expected) > 0.01)
+    if len(odd):
+        row, column = (int(index) for index in odd[0])
+        raise DataError(
+            f"{where}, observations: found {rows[row, 30 + column]:g} in column {30 + column}, but the goal of task "
+            f"'{task.name}' ({', '.join(task.subtasks)}) has {expected[column]:g} there; the data are of another task"
+        )

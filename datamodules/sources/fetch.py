@@ -1,0 +1,147 @@
+"""Where published data sets lie, on their servers and on this machine. Downloading runs nothing of theirs."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from pathlib import Path
+from urllib.parse import quote
+
+from datamodules.sources.download import download
+from datamodules.validation import DataError
+from dds_lightning.errors import UserError
+from dds_lightning.files import neighbours
+from dds_lightning.tasks import Task, get_task, task_names
+
+D4RL_SERVER = "http://rail.eecs.berkeley.edu/datasets/offline_rl"
+"""D4RL's public server. It has no encryption and publishes no hashes; files are checked when they are read."""
+
+D4RL_SETS = {"locomotion": ("gym_mujoco_v2", "v2"), "antmaze": ("ant_maze_v2", "v2"), "kitchen": ("kitchen", "v0")}
+"""Family -> folder on D4RL's server, and the version that D4RL's names of its files end in."""
+
+MINARI_SERVER = "https://huggingface.co/datasets/farama-minari"
+"""Where Minari publishes its data sets: a repository a name space, a folder a data set."""
+
+
+def fetch(task_name: str, source: str = "d4rl", out: str | Path | None = None) -> Path:
+    """Download the data set that a source publishes for a task; after a cut, call again.
+
+    Args:
+        task_name: A task of the table.
+        source: "d4rl" or "minari".
+        out: Folder of data sets; None takes D4RL's or Minari's own.
+
+    Returns:
+        D4RL's file, or the folder of Minari's data set.
+
+    Raises:
+        UserError: For an unknown task or source, a task without data there, or when downloading fails; the
+            message says what to do.
+    """
+    if source == "d4rl":
+        return fetch_d4rl(get_task(task_name), out)
+    if source == "minari":
+        return fetch_minari(_published(get_task(task_name), "minari"), out)
+    raise UserError(f"source: found '{source}', expected d4rl or minari")
+
+
+def fetch_d4rl(task: Task, folder: str | Path | None = None) -> Path:
+    """Download a task's file from D4RL's server, unless it is there already.
+
+    Args:
+        task: A row of the table with a D4RL file.
+        folder: Where to put it; None takes `d4rl_root`.
+
+    Raises:
+        UserError: See `datamodules.sources.download.download`.
+    """
+    name = _published(task, "d4rl")
+    url = f"{D4RL_SERVER}/{D4RL_SETS[task.family][0]}/{quote(name)}"
+    return download(url, Path(folder or d4rl_root()).expanduser() / name)
+
+
+def fetch_minari(dataset_id: str, root: str | Path | None = None) -> Path:
+    """Download a data set that Minari publishes, unless it is there already.
+
+    Its two files are fetched directly: Minari's own downloader runs nothing of theirs either, but needs one more
+    package, and here the metadata are checked before the rest is fetched. The data set takes its name when both
+    are complete.
+
+    Args:
+        dataset_id: Minari's id.
+        root: Folder of data sets; None takes Minari's.
+
+    Raises:
+        UserError: See `datamodules.sources.download.download`.
+        DataError: For metadata that `load_trajectories` would refuse.
+    """
+    from datamodules.sources.minari import minari_root, read_metadata
+
+    if not re.fullmatch(r"[\w-]+(/[\w-]+)*", dataset_id):
+        raise UserError(f"data: '{dataset_id}' is no Minari id; one is pointmaze-large-diverse-v0")
+    folder = Path(root or minari_root()).expanduser() / dataset_id
+    if folder.exists():
+        return folder
+    repository, _, inner = dataset_id.partition("/")
+    address = f"{MINARI_SERVER}/{repository}/resolve/main/{f'{inner}/' if inner else ''}data"
+    partial = folder.with_name(f".{folder.name}.fetched")
+    download(f"{address}/metadata.json", partial / "data" / "metadata.json")
+    try:
+        read_metadata(partial / "data")
+    except DataError:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    download(f"{address}/main_data.hdf5", partial / "data" / "main_data.hdf5")
+    os.replace(partial, folder)
+    return folder
+
+
+def _published(task: Task, source: str) -> str:
+    if source not in task.data_ids:
+        others = ", ".join(f"{known}:{name}" for known, name in task.data_ids.items())
+        raise UserError(f"task '{task.name}' has no data set in source '{source}'; it has {others}")
+    return task.data_ids[source]
+
+
+# ---------------------------------------------------------------------- D4RL's files on this machine
+
+
+def d4rl_root() -> Path:
+    """Where D4RL keeps its files: D4RL_DATASET_DIR, else ~/.d4rl/datasets."""
+    return Path(os.environ.get("D4RL_DATASET_DIR") or Path.home() / ".d4rl" / "datasets")
+
+
+def find_d4rl(name: str) -> Path:
+    """The file that `d4rl:NAME` means.
+
+    Args:
+        name: A path; or, in D4RL's folder, the name of a file, of a task, or of D4RL's data set for it
+            (`antmaze-medium-play-v2`).
+
+    Raises:
+        DataError: When there is no such file; the message says how to get it.
+    """
+    path = Path(name).expanduser()
+    if path.exists():
+        return path
+    if len(path.parts) > 1:
+        raise DataError(f"data set '{path.name}': {path} is missing{neighbours(path)}")
+    task = next((task for task in map(get_task, task_names()) if name in _names(task)), None)
+    folder = d4rl_root()
+    for candidate in (name, f"{name}.hdf5", task.data_ids["d4rl"] if task else name):
+        if (folder / candidate).is_file():
+            return folder / candidate
+    remedy = f"get it with `dds data fetch {task.name}`" if task else "give its path"
+    raise DataError(
+        f"data set '{name}': there is no such file here nor in {folder}, which D4RL_DATASET_DIR sets; {remedy}, or "
+        "put the file there by hand"
+    )
+
+
+def _names(task: Task) -> tuple[str, ...]:
+    """What a task's file is called: file, task, and D4RL's name."""
+    file = task.data_ids.get("d4rl")
+    if file is None:
+        return ()
+    return file, file.removesuffix(".hdf5"), task.name, f"{task.name}-{D4RL_SETS[task.family][1]}"
