@@ -1,19 +1,22 @@
-"""Looking at data sets: what `dds data check`, `show` and `list` print."""
+"""Looking at data sets: what `dds data check` and `show` print."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from datamodules.sources import load_trajectories
-from datamodules.sources.minari import minari_root, read_metadata
+from datamodules.sources.subtasks import subtasks_completed
 from datamodules.trajectories import Trajectories
-from dds_lightning.errors import UserError
 from dds_lightning.tasks import Task, get_task
+from dds_lightning.tasks.layout import action_names, observation_names
+
+BLOCK = 65_536
+"""Rows that are looked at together: a data set of a million steps is never copied as a whole."""
 
 
 def check_dataset(spec: str, task: Task | str | None = None, *, horizon: int | None = None) -> dict[str, Any]:
@@ -41,12 +44,13 @@ def describe(
 
     Args:
         trajectories: The data.
-        task: Adds normalised scores and, in mazes, how many of the free cells were visited.
+        task: Adds normalised scores, names of the dimensions and, in mazes, how many of the free cells were
+            visited.
         horizon: Adds the number of segments of that many steps.
 
     Returns:
-        Facts by name, and a table with one row a column of the observations and actions: `dimension`,
-        `lowest`, `mean`, `std`, `highest`.
+        Facts by name, and a table with one row a column of the observations and actions: `dimension`, `name`
+        (of the task's number, "" without a task), `lowest`, `mean`, `std`, `highest`.
     """
     lengths, returns = trajectories.lengths, trajectories.returns
     terminated = trajectories.terminations[trajectories.step_offsets[1:] - 1]
@@ -66,28 +70,36 @@ def describe(
         "highest return": round(float(returns.max()), 3),
     }
     if task is not None:
-        facts["mean normalised score"] = round(float(task.normalised_score(returns).mean()), 2)
+        scored = returns
+        if task.subtasks:  # its rewards pay at every step for what is done, its score once
+            scored = subtasks_completed(trajectories, task).astype(np.float64)
+            facts["mean subtasks done"] = round(float(scored.mean()), 2)
+        facts["mean normalised score"] = round(float(task.normalised_score(scored).mean()), 2)
         if task.maze_map is not None:
             facts["episodes that reach the goal"] = int(terminated.sum())
             facts["free cells visited"] = f"{_visited(trajectories, task)} of {len(task.free_cells())}"
     if horizon is not None:
         facts[f"segments of {horizon} steps"] = len(trajectories.windows(horizon))
     facts["fingerprint"] = trajectories.fingerprint()
-    columns = {"observation": trajectories.observations, "action": trajectories.actions}
-    dimensions = pd.DataFrame(
-        [
-            {
-                "dimension": f"{kind} {j}",
-                "lowest": float(values[:, j].min()),
-                "mean": float(values[:, j].mean(dtype=np.float64)),
-                "std": float(values[:, j].std(dtype=np.float64)),
-                "highest": float(values[:, j].max()),
-            }
-            for kind, values in columns.items()
-            for j in range(values.shape[1])
-        ]
-    )
-    return facts, dimensions
+    return facts, dimension_table(trajectories, task)
+
+
+def dimension_table(trajectories: Trajectories, task: Task | None = None) -> pd.DataFrame:
+    """The range of every column of the observations and actions, see `describe`."""
+    parts = {
+        "observation": (trajectories.observations, observation_names(task) if task else ()),
+        "action": (trajectories.actions, action_names(task) if task else ()),
+    }
+    tables = []
+    for kind, (values, names) in parts.items():
+        width = values.shape[1]
+        fitting = len(names) == width
+        labels = {
+            "dimension": [f"{kind} {j}" for j in range(width)],
+            "name": list(names) if fitting else [""] * width,
+        }
+        tables.append(pd.DataFrame({**labels, **_moments(values)}))
+    return pd.concat(tables, ignore_index=True)
 
 
 def episode_table(trajectories: Trajectories) -> pd.DataFrame:
@@ -104,40 +116,52 @@ def episode_table(trajectories: Trajectories) -> pd.DataFrame:
     )
 
 
-def find_datasets(roots: Iterable[str | Path] = ()) -> pd.DataFrame:
-    """The Minari data sets in Minari's own folder and in others, without reading their arrays.
+def visits(trajectories: Trajectories, task: Task, resolution: int = 1) -> NDArray[np.int64]:
+    """How often every place of a maze was visited.
 
     Args:
-        roots: Folders to look in beside MINARI_DATASETS_PATH (or ~/.minari/datasets).
+        trajectories: Positions are the first two columns of the observations.
+        task: A maze task.
+        resolution: n, squares a cell on each axis.
 
     Returns:
-        One row a data set: `data set`, `environment`, `episodes`, `steps`, `data` (the spec to pass on) and
-        `problem`, which is empty when the metadata are sound.
+        (n * rows, n * columns) counts in the order of the map: row 0 is the map's first row. Positions outside
+        the map are not counted.
     """
-    rows: dict[Path, dict[str, Any]] = {}
-    for root in (minari_root(), *map(Path, roots)):
-        for path in sorted(root.glob("**/data/metadata.json")):
-            home = path.parent.parent
-            inside = home.relative_to(root)
-            if not any(part.startswith(".") for part in inside.parts):  # hidden: half-written by somebody
-                rows[home.resolve()] = {"data set": inside.as_posix(), **_row(home), "data": f"local:{home}"}
-    columns = ["data set", "environment", "episodes", "steps", "data", "problem"]
-    return pd.DataFrame(list(rows.values()), columns=columns)
-
-
-def _row(home: Path) -> dict[str, Any]:
-    try:
-        metadata = read_metadata(home / "data")
-    except UserError as error:
-        return {"environment": "", "episodes": 0, "steps": 0, "problem": str(error)}
-    return {
-        "environment": (metadata["env_spec"] or {}).get("id", ""),
-        "episodes": metadata.get("total_episodes", 0),
-        "steps": metadata.get("total_steps", 0),
-        "problem": "",
-    }
+    assert task.maze_map is not None, "only mazes have places"
+    rows, columns = len(task.maze_map) * resolution, len(task.maze_map[0]) * resolution
+    corner = task.cell_to_xy((-0.5, -0.5))
+    step = (task.cell_to_xy((0.5, 0.5)) - corner) / resolution  # along x and down the map, signs and all
+    counts = np.zeros(rows * columns, np.int64)
+    for block in _blocks(trajectories.observations[:, :2]):
+        j, i = np.floor((block - corner) / step).astype(np.int64).T
+        inside = (i >= 0) & (i < rows) & (j >= 0) & (j < columns)
+        counts += np.bincount(i[inside] * columns + j[inside], minlength=rows * columns)
+    return counts.reshape(rows, columns)
 
 
 def _visited(trajectories: Trajectories, task: Task) -> int:
-    cells = np.unique(task.xy_to_cell(trajectories.observations[:, :2]), axis=0)
-    return len({(int(i), int(j)) for i, j in cells} & set(task.free_cells()))
+    counts = visits(trajectories, task)
+    return sum(bool(counts[cell]) for cell in task.free_cells())
+
+
+def _moments(values: NDArray[np.float32]) -> dict[str, NDArray[np.float64]]:
+    """Lowest, mean, standard deviation and highest of each column (N, D)."""
+    origin = values[0].astype(np.float64)  # sums of squares about a value of the data lose no digits
+    total, squares = np.zeros_like(origin), np.zeros_like(origin)
+    for block in _blocks(values):
+        away = block - origin
+        total += away.sum(axis=0)
+        squares += np.einsum("nd,nd->d", away, away)
+    mean = total / len(values)
+    return {
+        "lowest": values.min(axis=0).astype(np.float64),
+        "mean": origin + mean,
+        "std": np.sqrt(np.maximum(squares / len(values) - mean**2, 0.0)),
+        "highest": values.max(axis=0).astype(np.float64),
+    }
+
+
+def _blocks(values: NDArray[np.float32]) -> Iterator[NDArray[np.float64]]:
+    for first in range(0, len(values), BLOCK):
+        yield values[first : first + BLOCK].astype(np.float64)

@@ -1,13 +1,12 @@
 """Reads Minari data sets without trusting them: nothing in a data set is ever run.
 
-Minari's own loader builds environments from `metadata.json`, and with them whatever that file names. Here the
-JSON is read first, both spaces must be there, the environment must be one of the task table, and HDF5 is read
-directly.
+Minari's own loader builds environments from `metadata.json`, and with them whatever that file names. Here that
+file is judged first (`datamodules.sources.metadata`), and HDF5 is read directly, episode by episode, no more of
+it than the task's observations need.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from pathlib import Path
@@ -17,31 +16,40 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from datamodules.sources.hdf5 import MAX_RATIO, SMALL, check_array, member, open_hdf5, read_rows
+from datamodules.sources.metadata import action_box, check_task, observation_layout, one_line, read_metadata
+from datamodules.sources.observations import Layout, Part
 from datamodules.trajectories import Trajectories
-from datamodules.validation import FIELDS, DataError
+from datamodules.validation import FIELDS, DataError, validate_episode
 from dds_lightning.errors import UserError
-from dds_lightning.tasks import Task, known_env_ids
+from dds_lightning.tasks import Task
 
-_TRUSTED_PACKAGES = ("gymnasium", "gymnasium_robotics")
+Fields = dict[str, NDArray[Any]]
 
 
 def load_minari_id(dataset_id: str, task: Task | None) -> Trajectories:
     """Read a data set of Minari's local store, by its id."""
-    return load_local(str(_minari_folder(dataset_id)), task)
+    return load_local(str(minari_folder(dataset_id)), task)
 
 
 def minari_env_id(dataset_id: str) -> str | None:
     """The environment that a data set of Minari's local store was recorded in; None where it does not say."""
-    return local_env_id(str(_minari_folder(dataset_id)))
+    return local_env_id(str(minari_folder(dataset_id)))
 
 
 def local_env_id(directory: str) -> str | None:
     """The same for a folder."""
-    spec = read_metadata(_data_folder(directory))["env_spec"]
+    spec = read_metadata(data_folder(directory))["env_spec"]
     return None if spec is None else str(spec["id"])
 
 
-def _minari_folder(dataset_id: str) -> Path:
+def minari_folder(dataset_id: str) -> Path:
+    """The folder of a data set in Minari's local store.
+
+    Raises:
+        UserError: For what is no id, such as a path out of the store.
+        DataError: When it is not there.
+    """
     if not re.fullmatch(r"[\w-]+(/[\w-]+)*", dataset_id):
         raise UserError(f"data: '{dataset_id}' is no Minari id; one is pointmaze-large-diverse-v0")
     folder = minari_root() / dataset_id
@@ -61,193 +69,162 @@ def minari_root() -> Path:
 def load_local(directory: str, task: Task | None) -> Trajectories:
     """Read the Minari data set in a folder (`DIR/data/main_data.hdf5` and `metadata.json`).
 
+    Memory holds the result and one episode, whatever the file stores beside them.
+
+    Args:
+        directory: The folder.
+        task: What the data must fit, from `resolve_task`; None takes any layout that is known.
+
     Raises:
         DataError: For anything missing, damaged, dangerous or of another task.
     """
-    data = _data_folder(directory)
+    data = data_folder(directory)
     metadata = read_metadata(data)
-    name = str(metadata.get("dataset_id", Path(directory).name))
     if task is not None:
-        _check_task(name, metadata, task)
-    low, high = _action_box(name, metadata)
-    path = data / "main_data.hdf5"
-    if not path.is_file():
-        raise DataError(f"data set '{name}': {path} is missing; found {_listing(data)}")
-    labels, episodes = _read_hdf5(path, name, metadata, task)
-    if task is not None:
-        low, high = np.full(task.action_dim, task.action_low), np.full(task.action_dim, task.action_high)
-    return Trajectories.from_episodes(
-        name,
-        episodes,
-        action_low=low,
-        action_high=high,
-        observation_dim=task.observation_dim if task else None,
-        action_dim=task.action_dim if task else len(low),
-        episode_names=labels,
-    )
+        check_task(metadata, task)
+    layout, (low, high) = observation_layout(metadata, task), action_box(metadata, task)
+    reader = _Reader(data / "main_data.hdf5", metadata["dataset_id"], layout, low, high)
+    lengths, arrays = reader.read(metadata.get("total_episodes"), metadata.get("total_steps"))
+    return Trajectories(name=reader.name, lengths=lengths, action_low=low, action_high=high, **arrays)
 
 
-def _data_folder(directory: str) -> Path:
+def data_folder(directory: str | Path) -> Path:
+    """Where `main_data.hdf5` and `metadata.json` of a data set's folder lie: in `data`, or in itself."""
     folder = Path(directory).expanduser()
     return folder / "data" if (folder / "data").is_dir() else folder
 
 
-def read_metadata(data: Path) -> dict[str, Any]:
-    """Read and check `metadata.json`; the environment it names must be one of the task table.
+class _Reader:
+    """Reads the episodes of one file.
 
-    Raises:
-        DataError: When it is missing, damaged, lacks a space, or names an unknown environment or foreign
-            code.
+    Args:
+        path: main_data.hdf5.
+        name: Of the data set, for messages.
+        layout: How observations become flat.
+        low: (A,) lower bounds of actions.
+        high: (A,) upper bounds.
     """
-    path = data / "metadata.json"
-    if not path.is_file():
-        raise DataError(f"data: {path} is missing, so {data} holds no Minari data set; found {_listing(data)}")
-    try:
-        metadata = dict(json.loads(path.read_text(encoding="utf-8")))
-    except (ValueError, TypeError, RecursionError) as error:
-        raise DataError(f"data: {path} is damaged: it holds no JSON object ({error})") from error
-    name = metadata.get("dataset_id", data.parent.name)
-    for key in ("observation_space", "action_space"):
-        if not isinstance(metadata.get(key), str):
+
+    def __init__(
+        self, path: Path, name: str, layout: Layout, low: NDArray[np.float32], high: NDArray[np.float32]
+    ) -> None:
+        self.path, self.name, self.layout, self.low, self.high = path, name, layout, low, high
+        self.width = layout.width
+        self.bytes = 0
+
+    def read(self, episodes: int | None, steps: int | None) -> tuple[NDArray[np.int64], Fields]:
+        """Every episode, checked by `validate_episode`.
+
+        Args:
+            episodes: How many the metadata promise; None where they do not.
+            steps: Likewise.
+
+        Returns:
+            Lengths (E,), and the arrays of all episodes end to end, as in `Trajectories`.
+        """
+        with open_hdf5(self.path, f"data set '{self.name}'") as file:
+            names = set(file)  # asking the file whether it has a name would follow links
+            labels = [f"episode_{number}" for number in range(len(names))]
+            self._keep_promise("episodes", episodes, len(labels))
+            if not labels:
+                raise DataError(f"data set '{self.name}' is empty: it has no episodes")
+            missing = next((label for label in labels if label not in names), None)
+            if missing is not None:
+                raise DataError(f"data set '{self.name}': {self.path} has {len(labels)} episodes, but no {missing}")
+            lengths = np.array([self._steps(file, label) for label in labels], np.int64)
+            self._keep_promise("steps", steps, int(lengths.sum()))
+            return lengths, self._arrays(file, labels, lengths)
+
+    def _keep_promise(self, what: str, promised: int | None, found: int) -> None:
+        if promised is not None and found != promised:
             raise DataError(
-                f"data set '{name}': metadata.json has no {key}; Minari would run the environment that the "
-                "file names to find out, so such data sets are refused"
+                f"data set '{self.name}': metadata.json promises {promised} {what}, but {self.path} holds {found}"
             )
-        try:
-            metadata[key] = json.loads(metadata[key])
-        except ValueError as error:
-            raise DataError(f"data set '{name}': {key} in metadata.json is damaged ({error})") from error
-    if metadata.get("data_format", "hdf5") != "hdf5":
-        raise DataError(f"data set '{name}': data_format is '{metadata['data_format']}', expected 'hdf5'")
-    metadata["env_spec"] = _env_spec(name, metadata.get("env_spec"))
-    return metadata
 
+    def _steps(self, file: h5py.File, label: str) -> int:
+        where = f"data set '{self.name}', {label}"
+        rewards = check_array(member(self._group(file, label), "rewards", where), f"{where}, rewards")
+        self._count(rewards.nbytes)
+        return len(rewards)
 
-def _env_spec(name: str, text: Any) -> dict[str, Any] | None:
-    if text is None:
-        return None
-    try:
-        spec = json.loads(text)
-        env_id, code = str(spec["id"]), [spec.get("entry_point")]
-        code += [wrapper["entry_point"] for wrapper in spec.get("additional_wrappers") or ()]
-        spec["kwargs"] = dict(spec.get("kwargs") or {})
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise DataError(f"data set '{name}': env_spec in metadata.json is damaged ({error!r})") from error
-    for found in code:
-        if found is not None and str(found).partition(":")[0].partition(".")[0] not in _TRUSTED_PACKAGES:
-            raise DataError(
-                f"data set '{name}': env_spec names the code '{found}', expected only environments of "
-                f"{' and '.join(_TRUSTED_PACKAGES)}; do not open this data set with other tools"
-            )
-    if env_id not in known_env_ids():
-        raise DataError(f"data set '{name}': it was recorded in '{env_id}', which no task uses; see `dds tasks`")
-    return dict(spec)
+    def _arrays(self, file: h5py.File, labels: list[str], lengths: NDArray[np.int64]) -> Fields:
+        arrays: Fields = {}
+        step = 0
+        for number, label in enumerate(labels):
+            fields = self._episode(file, label)
+            if not arrays:
+                self.width = fields["observations"].shape[1]  # where no task said it, all have that of the first
+                arrays = self._empty(fields, int(lengths.sum()), len(labels))
+            for key, one in fields.items():
+                first = step + (number if key == "observations" else 0)
+                arrays[key][first : first + len(one)] = one
+            step += int(lengths[number])
+        return arrays
 
+    def _empty(self, fields: Fields, steps: int, episodes: int) -> Fields:
+        """Room for all episodes; `fields` are those of one."""
+        rows = {key: steps + (episodes if key == "observations" else 0) for key in fields}
+        self._believe(sum(rows[key] * one[:1].nbytes for key, one in fields.items()))
+        return {key: np.empty((rows[key], *one.shape[1:]), one.dtype) for key, one in fields.items()}
 
-def _check_task(name: str, metadata: dict[str, Any], task: Task) -> None:
-    spec = metadata["env_spec"]
-    if spec is None:
-        raise DataError(
-            f"data set '{name}': metadata.json has no env_spec, so nothing says that it was recorded in "
-            f"{task.env_id}, which task '{task.name}' needs"
+    def _episode(self, file: h5py.File, label: str) -> Fields:
+        where, group = f"data set '{self.name}', {label}", self._group(file, label)
+        fields = {}
+        for key in FIELDS:
+            read = self._observations if key == "observations" else self._array
+            fields[key] = read(member(group, key, where), f"{where}, {key}")
+        return validate_episode(
+            self.name, label, fields, observation_dim=self.width, action_low=self.low, action_high=self.high
         )
-    if spec["id"] not in (task.env_id, *task.data_env_ids):
-        raise DataError(
-            f"data set '{name}' was recorded in {spec['id']}, but task '{task.name}' needs {task.env_id}; "
-            "choose the task that fits the data, or other data"
-        )
-    maze_map = spec["kwargs"].get("maze_map")
-    if task.maze_map is not None and maze_map is not None:
-        rows = [_as_list(row) for row in _as_list(maze_map)]
-        walls = tuple("".join("1" if value == 1 else "0" for value in row) for row in rows)
-        if walls != task.maze_map:
+
+    def _group(self, file: h5py.File, label: str) -> h5py.Group:
+        where = f"data set '{self.name}', {label}"
+        group = member(file, label, f"data set '{self.name}'")
+        if not isinstance(group, h5py.Group):
+            raise DataError(f"{where}: found an array, expected a group of {', '.join(FIELDS)}")
+        found = list(group)
+        missing = next((key for key in FIELDS if key not in found), None)
+        if missing:
+            raise DataError(f"{where}: '{missing}' is missing; found {one_line(', '.join(found)) or 'nothing'}")
+        return group
+
+    def _observations(self, node: Any, where: str) -> NDArray[Any]:
+        if not self.layout.parts:
+            return self._array(node, where)
+        if not isinstance(node, h5py.Group):
+            raise DataError(f"{where}: found an array, expected a group, for the observation space is {self.layout}")
+        arrays = {key: self._part(node, key, part, where) for key, part in self.layout.parts.items()}
+        rows = {key: len(array) for key, array in arrays.items()}
+        if len(set(rows.values())) > 1:
+            found = " and ".join(f"{count} rows of {key}" for key, count in rows.items())
+            raise DataError(f"{where}: found {found}, expected the same number")
+        return self.layout.flatten(arrays)
+
+    def _part(self, group: h5py.Group, key: str, part: Part, where: str) -> NDArray[Any]:
+        found = list(group)
+        if key not in found:
+            raise DataError(f"{where}: found the entries {one_line(', '.join(found)) or 'none'}, expected '{key}'")
+        node, where = member(group, key, where), f"{where}/{key}"
+        array = check_array(node, where)
+        if len(array.shape) != 2 or array.shape[1] not in part.widths:
+            expected = " or ".join(f"(steps, {width})" for width in part.widths)
+            raise DataError(f"{where}: found shape {array.shape}, expected {expected}")
+        self._count(array.nbytes)
+        return read_rows(array, where, 0, len(array), part.columns)
+
+    def _array(self, node: Any, where: str) -> NDArray[Any]:
+        array = check_array(node, where)
+        self._count(array.nbytes)
+        return read_rows(array, where, 0, len(array))
+
+    def _count(self, size: int) -> None:
+        """Add up what is read: many episodes may share one array, or each be packed very small."""
+        self.bytes += size
+        self._believe(self.bytes)
+
+    def _believe(self, size: int) -> None:
+        if size > max(SMALL, MAX_RATIO * self.path.stat().st_size):
             raise DataError(
-                f"data set '{name}' was recorded in {spec['id']} with other walls ({'/'.join(walls)}) than "
-                f"task '{task.name}' has ({'/'.join(task.maze_map)})"
+                f"data set '{self.name}': the arrays of {self.path} are more than {MAX_RATIO} times as large as the "
+                "file, which is not believed"
             )
-
-
-def _action_box(name: str, metadata: dict[str, Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    space = metadata["action_space"]
-    try:
-        low, high = (np.array(space[key], np.float32).reshape(-1) for key in ("low", "high"))
-        sound = space["type"] == "Box" and low.shape == high.shape == (int(np.prod(space["shape"])),)
-    except (KeyError, TypeError, ValueError):
-        sound = False
-    if not sound or not np.isfinite([low, high]).all():
-        raise DataError(f"data set '{name}': its action space is {space}, expected a bounded Box")
-    return low, high
-
-
-def _as_list(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else [value]
-
-
-def _read_hdf5(
-    path: Path, name: str, metadata: dict[str, Any], task: Task | None
-) -> tuple[list[str], list[dict[str, NDArray[Any]]]]:
-    try:
-        with h5py.File(path, "r") as file:
-            labels = sorted(file, key=lambda key: int(key.removeprefix("episode_")))
-            total = metadata.get("total_episodes")
-            in_order = labels == [f"episode_{i}" for i in range(len(labels))]
-            if total is not None and (len(labels) != total or not in_order):
-                raise DataError(
-                    f"data set '{name}': metadata.json promises {total} episodes, but {path} holds "
-                    f"{len(labels)}{f' ({labels[0]} to {labels[-1]})' if labels else ''}"
-                )
-            episodes = [_read_episode(file, name, label, task) for label in labels]
-    except DataError:
-        raise
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
-        raise DataError(f"data set '{name}': {path} is truncated or damaged ({error})") from error
-    steps = sum(len(fields["rewards"]) for fields in episodes)
-    promised = metadata.get("total_steps")
-    if promised is not None and steps != promised:
-        raise DataError(f"data set '{name}': metadata.json promises {promised} steps, but {path} holds {steps}")
-    return labels, episodes
-
-
-def _read_episode(file: h5py.File, name: str, label: str, task: Task | None) -> dict[str, NDArray[Any]]:
-    group = _member(file, label, f"data set '{name}'")
-    where = f"data set '{name}', {label}"
-    if not isinstance(group, h5py.Group):
-        raise DataError(f"{where}: found an array, expected a group of {', '.join(FIELDS)}")
-    fields = {}
-    for key in FIELDS:
-        if key not in group:
-            raise DataError(f"{where}: '{key}' is missing; found {', '.join(group) or 'nothing'}")
-        node = _member(group, key, where)
-        if isinstance(node, h5py.Group):
-            node = _observation(node, key, where, task)
-        try:
-            fields[key] = node[()]
-        except (OSError, RuntimeError) as error:
-            raise DataError(f"{where}, {key}: {file.filename} is damaged there ({error})") from error
-    return fields
-
-
-def _observation(group: h5py.Group, key: str, where: str, task: Task | None) -> h5py.Dataset:
-    """The flat part of a dictionary observation; goals are left out, because a task has one."""
-    if key != "observations" or "observation" not in group:
-        raise DataError(f"{where}, {key}: found the entries {', '.join(group) or 'none'}, expected 'observation'")
-    node = _member(group, "observation", f"{where}, {key}")
-    if not isinstance(node, h5py.Dataset):
-        raise DataError(f"{where}, {key}: 'observation' is no array")
-    return node
-
-
-def _member(group: h5py.Group, key: str, where: str) -> Any:
-    """A member that is stored in this very file: links may point at any file of the reader's machine."""
-    if not isinstance(group.get(key, getlink=True), h5py.HardLink):
-        raise DataError(f"{where}: '{key}' is a link to elsewhere, expected the data themselves")
-    node = group[key]
-    if isinstance(node, h5py.Dataset) and node.external:
-        raise DataError(f"{where}: '{key}' is stored in another file, expected the data themselves")
-    return node
-
-
-def _listing(folder: Path) -> str:
-    if not folder.is_dir():
-        return "no such folder"
-    return ", ".join(sorted(path.name for path in folder.iterdir())[:8]) or "nothing"

@@ -56,7 +56,7 @@ class Task:
         data_reward: What the learner's rewards are made from: "environment", as recorded; "goal", 1 where the
             step reaches the task's goal; "arrival", the same where the recording says so, because its goal is one
             of many; "subtasks", the number of subtasks that are done in the state
-            reached, at every step, as D4RL's kitchen files have it.
+            reached, at every step.
         reward_scale: The learner's reward is `reward_scale * (reward + reward_shift)`; scores never use it.
         reward_shift: See `reward_scale`.
         score_min: Return of the environment's own rewards that scores 0.

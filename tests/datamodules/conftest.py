@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,8 @@ import numpy as np
 import pytest
 
 from dds_lightning.tasks import get_task
+from tests.minari_recordings import write_minari_set
+from tests.refusals import MAZE, PAYLOAD, maze_episodes
 
 
 @pytest.fixture
@@ -46,14 +49,18 @@ def minari_set(tmp_path: Path) -> Callable[..., Path]:
         data = folder / "data"
         data.mkdir(parents=True)
         box = {"type": "Box", "dtype": "float32", "shape": [2], "low": [-1, -1], "high": [1, 1]}
+        widths = {"achieved_goal": 2, "desired_goal": 2, "observation": 4}
+        seen = {key: {"type": "Box", "dtype": "float64", "shape": [width]} for key, width in widths.items()}
         facts: dict[str, Any] = {
             "dataset_id": "set-v0",
             "total_episodes": episodes,
             "total_steps": episodes * steps,
             "data_format": "hdf5",
-            "observation_space": json.dumps({"type": "Dict", "subspaces": {}}),
+            "observation_space": json.dumps({"type": "Dict", "subspaces": seen}),
             "action_space": json.dumps(box),
-            "env_spec": json.dumps({"id": get_task(task).env_id, "entry_point": "gymnasium_robotics:PointMazeEnv"}),
+            "env_spec": json.dumps(
+                {"id": get_task(task).env_id, "entry_point": "gymnasium_robotics.envs.maze.point_maze:PointMazeEnv"}
+            ),
         }
         facts.update(metadata or {})
         facts = {key: value for key, value in facts.items() if value is not None}
@@ -73,3 +80,20 @@ def minari_set(tmp_path: Path) -> Callable[..., Path]:
         return folder
 
     return write
+
+
+@pytest.fixture
+def sentinel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file that exists as soon as the stranger's module is imported, which takes nothing but its name."""
+    path = tmp_path / "the payload ran"
+    module = tmp_path / "code" / f"{PAYLOAD.partition(':')[0]}.py"
+    module.parent.mkdir()
+    module.write_text(f"open({str(path)!r}, 'w').close()\nfrom gymnasium import Env\n")
+    monkeypatch.syspath_prepend(module.parent)
+    monkeypatch.delitem(sys.modules, module.stem, raising=False)
+    return path
+
+
+@pytest.fixture
+def maze_set(tmp_path: Path) -> Path:
+    return write_minari_set(tmp_path / "sets", "set-v0", get_task(MAZE), maze_episodes())

@@ -177,7 +177,7 @@ def test_flipped_bytes_of_the_data_are_noticed(large: Path, tmp_path: Path) -> N
         broken = bytearray(whole)
         broken[place + offset] ^= 1
         (tmp_path / "data" / "main_data.hdf5").write_bytes(broken)
-        with pytest.raises(DataError, match=r"episode_1, observations: .* is damaged there"):
+        with pytest.raises(DataError, match=r"episode_1, observations/observation: .* is damaged there"):
             load_trajectories(f"local:{tmp_path}", LARGE)
 
 

@@ -1,0 +1,129 @@
+"""From observations as environments record them to the flat ones of the task table: the one place that does.
+
+| layout | what is recorded at a step | flat observation |
+|---|---|---|
+| flat | Box (O,) | as it is |
+| pointmaze | Dict: `observation` (4,) | `observation` |
+| antmaze | Dict: `achieved_goal` (2,), `observation` (27,), in v5 (105,) with contact forces | both, 27 of the second |
+| kitchen | Dict: `observation` (59,) | positions of robot and objects (30), goal of the subtasks (30) |
+
+Goals that a recording had are left out: a task has one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dds_lightning.envs.kitchen import goal_vector, kitchen_layout
+from dds_lightning.tasks import Task
+
+
+class Part(NamedTuple):
+    """One array of a dictionary observation.
+
+    Attributes:
+        widths: That it may have.
+        columns: How many of them are read, from the first on.
+    """
+
+    widths: tuple[int, ...]
+    columns: int
+
+
+PARTS: dict[str, dict[str, Part]] = {
+    "flat": {},
+    "pointmaze": {"observation": Part((4,), 4)},
+    "antmaze": {"achieved_goal": Part((2,), 2), "observation": Part((27, 105), 27)},
+    "kitchen": {"observation": Part((59,), 59)},
+}
+"""Layout -> the arrays that are read of a dictionary; none where the observation is one array."""
+
+
+class Layout(NamedTuple):
+    """How the observations of one recording become flat.
+
+    Attributes:
+        name: A key of `PARTS`.
+        width: O of flat observations; None takes any.
+        subtasks: In the kitchen, what the goal is.
+    """
+
+    name: str
+    width: int | None = None
+    subtasks: Sequence[str] = ()
+
+    @property
+    def parts(self) -> dict[str, Part]:
+        """The arrays that are read of a dictionary; none where the observation is one array."""
+        return PARTS[self.name]
+
+    def fits(self, space: Mapping[str, Any]) -> bool:
+        """Whether observations of a space (Minari's JSON) have this layout."""
+        if not self.parts:
+            shape = box_shape(space) or ()
+            return len(shape) == 1 and self.width in (None, *shape)
+        shapes = {name: box_shape(inner) for name, inner in _subspaces(space).items()}
+        return all(shapes.get(name) in [(width,) for width in part.widths] for name, part in self.parts.items())
+
+    def __str__(self) -> str:
+        """The space, for messages."""
+        if not self.parts:
+            return f"a Box ({'any' if self.width is None else self.width},)"
+        shapes = (f"{name} {' or '.join(f'({width},)' for width in part.widths)}" for name, part in self.parts.items())
+        return f"a Dict of {', '.join(shapes)}"
+
+    def flatten(self, arrays: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+        """The flat observations of one episode.
+
+        Args:
+            arrays: Those of `parts`, (T + 1, columns) each.
+
+        Returns:
+            (T + 1, O) in the type of the arrays.
+        """
+        columns = list(arrays.values())
+        if self.name == "kitchen":
+            positions = kitchen_layout(arrays["observation"])
+            columns = [positions, np.tile(goal_vector(self.subtasks), (len(positions), 1))]
+        return columns[0] if len(columns) == 1 else np.concatenate(columns, axis=1)
+
+
+def task_layout(task: Task) -> Layout:
+    """How recordings of a task's environments look."""
+    return Layout("flat" if task.adapter == "flat" else task.family, task.observation_dim, task.subtasks)
+
+
+def find_layout(space: Mapping[str, Any], subtasks: Sequence[str]) -> Layout | None:
+    """The layout that a space has, where no task says it; None where it is none of ours."""
+    return next((layout for name in PARTS if (layout := Layout(name, subtasks=subtasks)).fits(space)), None)
+
+
+def space_in_words(space: Mapping[str, Any]) -> str:
+    """A space in a few words, for messages."""
+    inner = _subspaces(space)
+    if inner:
+        return f"a Dict of {', '.join(f'{name} {_size(one)}' for name, one in list(inner.items())[:6])}"
+    return f"a Box {_size(space)}" if space.get("type") == "Box" else f"a {space.get('type')}"
+
+
+def box_shape(space: Any) -> tuple[int, ...] | None:
+    """Shape of a Box in Minari's JSON; None for anything else."""
+    if not isinstance(space, Mapping) or space.get("type") != "Box" or not isinstance(space.get("shape"), list):
+        return None
+    sizes = space["shape"]
+    return tuple(sizes) if all(type(size) is int and size >= 0 for size in sizes) else None
+
+
+def _subspaces(space: Mapping[str, Any]) -> dict[str, Any]:
+    inner = space.get("subspaces") if space.get("type") == "Dict" else None
+    return inner if isinstance(inner, dict) else {}
+
+
+def _size(space: Any) -> str:
+    if not isinstance(space, Mapping):
+        return "without a space"
+    return str(box_shape(space) or space.get("shape")) if space.get("type") == "Box" else str(space.get("type"))
