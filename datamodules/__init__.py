@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from datamodules.collect.pointmaze import collect_pointmaze as collect_pointmaze
     from datamodules.inspection import check_dataset as check_dataset
     from datamodules.inspection import describe as describe
-    from datamodules.inspection import find_datasets as find_datasets
+    from datamodules.listing import find_datasets as find_datasets
     from datamodules.relabeled import RelabeledDataModule as RelabeledDataModule
     from datamodules.segments import SegmentDataModule as SegmentDataModule
     from datamodules.segments import TensorLoader as TensorLoader
@@ -32,7 +32,7 @@ _HOMES = {
     "check_dataset": "datamodules.inspection",
     "collect_pointmaze": "datamodules.collect.pointmaze",
     "describe": "datamodules.inspection",
-    "find_datasets": "datamodules.inspection",
+    "find_datasets": "datamodules.listing",
     "load_trajectories": "datamodules.sources",
 }
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from datamodules.relabel import Discount, Relabelled, relabel, relabel_key
 from datamodules.segments import TensorLoader
-from datamodules.sources import load_trajectories
+from datamodules.sources import load_trajectories, resolve_task
 from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError
 from dds_lightning.skill import SkillModule
@@ -30,8 +30,9 @@ class RelabeledDataModule(pl.LightningDataModule):
     gamma, discount, stride and reward convention, so that nothing stale is ever read.
 
     Args:
-        task: name of a task (``dds tasks``); null for your own data.
-        data: where the data are, e.g. ``local:DIR`` or ``minari:ID``.
+        task: name of a task (``dds tasks``); null for your own data. The attribute ``task`` is, after ``setup``, the
+            variant in which the data were recorded.
+        data: where the data are, e.g. ``local:DIR``, ``minari:ID`` or ``d4rl:FILE``.
         skill: skill checkpoint: a Lightning ``.ckpt`` or a published directory.
         relabelled: read this file (of ``dds relabel``) instead of the cache; refused if made from anything else.
         cache: folder of the cache; null puts it beside the skill checkpoint, or in the user's cache folder where that
@@ -88,13 +89,15 @@ class RelabeledDataModule(pl.LightningDataModule):
 
     @cached_property
     def trajectories(self) -> Trajectories:
-        """The data set, loaded at first use."""
+        """The data set, loaded at first use; from then on ``task`` is the variant it was recorded in."""
         if self._given is not None:
             return self._given
         if self.hparams.data is None:
             raise UserError(
-                "data.data is missing: give local:DIR or minari:ID, or collect with `dds data collect TASK`"
+                "data.data is missing: give local:DIR, minari:ID or d4rl:FILE, or collect with `dds data collect TASK`"
             )
+        if self.task is not None:
+            self.task = resolve_task(self.hparams.data, self.task)
         return load_trajectories(self.hparams.data, self.task)
 
     @property

@@ -12,7 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from datamodules.sources import load_trajectories
+from datamodules.collect.collectors import COLLECTORS
+from datamodules.sources import load_trajectories, resolve_task
 from datamodules.trajectories import Trajectories, Windows
 from dds_lightning.errors import UserError
 from dds_lightning.nn.normaliser import MIN_STD
@@ -140,6 +141,7 @@ class SegmentDataModule(pl.LightningDataModule):
 
     Attributes:
         trajectories: All data, after `setup`.
+        task: What the data are for; after `setup` the variant in which they were recorded.
         horizon: H.
     """
 
@@ -161,7 +163,7 @@ class SegmentDataModule(pl.LightningDataModule):
 
         Args:
             task: Name of a task (`dds tasks` lists them). The data must fit it. None takes any sound data.
-            data: `local:DIR`, `minari:ID` or `arrays:DIR`, see `datamodules.load_trajectories`.
+            data: For example `local:DIR`, `minari:ID` or `d4rl:FILE`, see `datamodules.load_trajectories`.
             horizon: H, steps of a segment.
             stride: Steps between segments: 1 takes every window, H divides episodes into separate segments.
             batch_size: B.
@@ -276,12 +278,16 @@ class SegmentDataModule(pl.LightningDataModule):
         if not hasattr(self, "trajectories"):
             if self.data is None:
                 raise UserError(self._how_to_get_data())
+            if self.task is not None:
+                self.task = resolve_task(self.data, self.task)
             self.trajectories = load_trajectories(self.data, self.task)
         return self.trajectories
 
     def _how_to_get_data(self) -> str:
         if self.task is None:
             return "data: neither a task nor data were given; give at least data, for example local:DIR"
+        if self.task.family not in COLLECTORS:
+            return f"data: none was given for task '{self.task.name}'; give d4rl:FILE or minari:ID"
         collected = f"`dds data collect {self.task.name} --out data`"
         place = f"local:data/{self.task.data_ids.get('local', self.task.name)}"
         return f"data: none was given for task '{self.task.name}'; {collected} makes some, then give {place}"

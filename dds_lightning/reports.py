@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -55,6 +56,18 @@ def plain(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value)
     return value
+
+
+def pairs(lines: Iterable[tuple[str, Any]], title: str | None = None) -> "Table":
+    """Draw facts below each other: name and value, long values wrapped beside their name."""
+    from rich.table import Table
+
+    drawn = Table(title=title, title_justify="left", box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
+    drawn.add_column(no_wrap=True)
+    drawn.add_column(overflow="fold")
+    for name, value in lines:
+        drawn.add_row(name, str(value))
+    return drawn
 
 
 def table(frame: "pd.DataFrame", title: str | None = None, digits: int = 3) -> "Table":

@@ -44,9 +44,10 @@ class RolloutResult:
         task: name of the task.
         episodes: one row an episode: `actor`, `label` (the part of the contestant, else its name), `episode`
             (counted within the contestant), `seed` (of the environment), `return` (environment's own
-            rewards), `score` (normalised, 0 to 100), `success`, `terminated`, `length` (steps), `final_x` and
-            `final_y` (metres; NaN where there is no maze), `final_code` (skill in use at the end; -1 without
-            skills), `codes` (list of the skills chosen, one a decision).
+            rewards), `score` (normalised, 0 to 100), `success` (missing where the task does not measure it),
+            `terminated`, `length` (steps), `final_x` and `final_y` (metres; NaN where there is no maze),
+            `final_code` (skill in use at the end; -1 without skills), `codes` (list of the skills chosen, one
+            a decision).
         paths: (actor, episode) to `RolloutPath`; empty unless recorded.
     """
 
@@ -57,21 +58,23 @@ class RolloutResult:
     def summary(self, by: str = "actor") -> pd.DataFrame:
         """One row for each `actor` or `label`, in the table's order.
 
-        Columns: `episodes`, `success` (per cent), `score` (mean), `score_error` (its standard error),
-        `return`, `length` (means), `length_success` (mean steps of the successful episodes; NaN if none).
+        Columns: `episodes`, `success` (per cent; NaN where the task does not measure it), `score` (mean),
+        `score_error` (its standard error), `return`, `length` (means), `length_success` (mean steps of the
+        successful episodes; NaN if none).
         """
         rows = []
         for name, part in self.episodes.groupby(by, sort=False):
+            success = part["success"].astype(float)  # NaN where it is missing
             rows.append(
                 {
                     by: name,
                     "episodes": len(part),
-                    "success": 100.0 * part["success"].mean(),
+                    "success": 100.0 * success.mean(),
                     "score": part["score"].mean(),
                     "score_error": part["score"].std(ddof=1) / np.sqrt(len(part)) if len(part) > 1 else np.nan,
                     "return": part["return"].mean(),
                     "length": part["length"].mean(),
-                    "length_success": part.loc[part["success"], "length"].mean(),
+                    "length_success": part.loc[success == 1.0, "length"].mean(),
                 }
             )
         return pd.DataFrame(rows)

@@ -89,14 +89,18 @@ def rollout(
     with contextlib.ExitStack() as stack:
         if pool is None:
             pool = stack.enter_context(EnvPool(task, total, workers))
-        report = stack.enter_context(_progress_bar(sum(plan.contestant.episodes for plan in plans), progress))
+        count = sum(plan.contestant.episodes for plan in plans)
+        report = stack.enter_context(_progress_bar(count, progress, "success" if task.measures_success else "score"))
         match = _Match(pool, plans, seed, record or record_observations, record_observations, report)
         stack.enter_context(_torch_threads(threads))
         rows = match.play(take_seats(bundles, plans, seed))
     order = {contestant.name: i for i, contestant in enumerate(contestants)}
     rows.sort(key=lambda row: (order[row["actor"]], row["episode"]))
     paths = {(row["actor"], row["episode"]): row.pop("path") for row in rows}
-    return RolloutResult(task.name, pd.DataFrame(rows), {key: path for key, path in paths.items() if path})
+    table = pd.DataFrame(rows)
+    if not task.measures_success:
+        table["success"] = pd.array([None] * len(table), dtype="boolean")  # missing, which is not failed
+    return RolloutResult(task.name, table, {key: path for key, path in paths.items() if path})
 
 
 # ---------------------------------------------------------------------- playing
@@ -112,7 +116,7 @@ class _Match:
         seed: int,
         record: bool,
         record_observations: bool,
-        report: Callable[[bool], None],
+        report: Callable[[float], None],
     ) -> None:
         self.pool, self.task, self.report = pool, pool.task, report
         self.who = [plan.contestant for plan in plans for _ in plan.slots]
@@ -153,7 +157,7 @@ class _Match:
         ended = records["terminated"] | records["truncated"]
         rows = [self._finish(slots[row], records[row]) for row in np.flatnonzero(ended)]
         for row in rows:
-            self.report(row["success"])
+            self.report(100.0 * row["success"] if self.task.measures_success else row["score"])
         again = ended & records["alive"]
         self.restarted[slots] = again
         self.observations[slots] = records["observation"]
@@ -235,30 +239,31 @@ def _torch_threads(count: int) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _progress_bar(total: int, wanted: bool) -> Iterator[Callable[[bool], None]]:
-    """A bar of episodes done and the share that succeeded so far, on standard error; silent elsewhere."""
+def _progress_bar(total: int, wanted: bool, what: str) -> Iterator[Callable[[float], None]]:
+    """A bar of episodes done and the mean so far of "success" or "score", on standard error; silent elsewhere."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     console = Console(stderr=True)
     if not (wanted and console.is_terminal):
-        yield lambda success: None
+        yield lambda value: None
         return
+    unit = " %" if what == "success" else ""
     columns = (
         TextColumn("episodes"),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("success {task.fields[share]:.0f} %"),
+        TextColumn(f"{what} {{task.fields[mean]:.0f}}{unit}"),
         TimeRemainingColumn(),
     )
-    successes = 0
+    values = 0.0
     with Progress(*columns, console=console, transient=True) as bar:
-        line = bar.add_task("episodes", total=total, share=0.0)
+        line = bar.add_task("episodes", total=total, mean=0.0)
 
-        def report(success: bool) -> None:
-            nonlocal successes
-            successes += success
+        def report(value: float) -> None:
+            nonlocal values
+            values += value
             done = bar.tasks[0].completed + 1
-            bar.update(line, advance=1, share=100.0 * successes / done)
+            bar.update(line, advance=1, mean=values / done)
 
         yield report

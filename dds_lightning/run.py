@@ -8,46 +8,22 @@
 The two trainings are the very commands `dds skill fit` and `dds policy fit`, whose words are printed.
 """
 
-import hashlib
 import json
 import shlex
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from dds_lightning.configs import find_preset
 from dds_lightning.errors import UserError
 from dds_lightning.reports import Report
+from dds_lightning.run_settings import RunSettings as RunSettings
+from dds_lightning.run_settings import Trainings
 from dds_lightning.stages import Done, Stages, duration, locked
-from dds_lightning.study import contestants
+from dds_lightning.study import contestants, protocol
 from dds_lightning.tasks import Task, get_task
 
 STAGES = ("data", "skill", "relabel", "policy", "clone", "evaluate", "report")
-_PLACES = ("default_root_dir", "logger", "enable_progress_bar", "enable_model_summary")
-
-
-@dataclass(frozen=True)
-class RunSettings:
-    """What `dds run` was asked to do; see `dds run --help`."""
-
-    task: str
-    out: Path
-    data: str | None = None
-    seed: int = 0
-    preset: str | None = None
-    data_steps: int = 200_000
-    clone_steps: int = 4000
-    episodes: int | None = None
-    episodes_per_skill: int = 20
-    selection: str = "sample"
-    temperature: float = 1.0
-    workers: int | None = None
-    until: str = STAGES[-1]
-    fresh: bool = False
-    skill: tuple[str, ...] = ()
-    policy: tuple[str, ...] = ()
 
 
 def run_all(settings: RunSettings) -> Report:
@@ -64,13 +40,12 @@ class Run:
 
     def __init__(self, settings: RunSettings) -> None:
         """Check everything that can be checked before the first file."""
-        from dds_lightning.training.fitting import quieten, settings_of
+        from dds_lightning.training.fitting import quieten
 
         quieten()
         self.wanted = settings
         self.task: Task = get_task(settings.task)
         self.out = settings.out
-        self.preset = find_preset(settings.preset or self.task.family)
         for name, value in (
             ("data_steps", settings.data_steps),
             ("clone_steps", settings.clone_steps),
@@ -79,12 +54,24 @@ class Run:
         ):
             if value < 1:
                 raise UserError(f"--{name} is {value}, expected at least 1")
-        self.data_signature = _signature(settings.data)
-        # Parsing both commands now finds a wrong setting before the data are collected.
-        self.settings = {
-            stage: settings_of(stage, self._words(stage, settings.data or "local:.")) for stage in ("skill", "policy")
-        }
+        self.data_signature = self._look_at_data()
+        self.trainings = Trainings(settings, self.task)
         self.console = Console(stderr=True)
+
+    def _look_at_data(self) -> str | None:
+        """Fingerprint of the files that were given, and the task in the variant in which they were recorded."""
+        spec = self.wanted.data
+        if spec is None:
+            from datamodules.collect.collectors import refuse_uncollectable
+
+            refuse_uncollectable(self.task)
+            return None
+        from datamodules.signature import signature
+        from datamodules.sources import resolve_task
+
+        found = signature(spec)
+        self.task = resolve_task(spec, self.task)
+        return found
 
     @property
     def episodes(self) -> int:
@@ -94,6 +81,10 @@ class Run:
     def everything(self) -> Report:
         """Do the stages up to the one asked for, and tell what they made."""
         with locked(self.out):
+            if self.task.name != self.wanted.task:
+                chosen = f"evaluating in {self.task.name} ({self.task.env_id})"
+                told = f"the data were recorded in another physics than {self.wanted.task}'s: {chosen}"
+                self.console.print(told, highlight=False, soft_wrap=True)
             stages = Stages(self.out, self.console, self.wanted.fresh)
             self._stages(stages, STAGES.index(self.wanted.until))
         return self._report(stages.done)
@@ -111,21 +102,21 @@ class Run:
         self.data_facts = data.facts["facts"]
         if last < 1:
             return
-        model = self.settings["skill"]["model"]
-        steps = self.settings["skill"]["trainer"]["max_steps"]
+        model = self.trainings.settings["skill"]["model"]
+        steps = self.trainings.settings["skill"]["trainer"]["max_steps"]
         title = f"skill: {model['num_skills']} codes, {steps:,} steps"
-        self.skill = stages.do("skill", title, self._essence("skill"), [data], self._skill)
+        self.skill = stages.do("skill", title, self.trainings.essence("skill"), [data], self._skill)
         if last < 2:
             return
-        settings = {"task": self.task.name, **self._relabelling()}
+        settings = {"task": self.task.name, **self.trainings.relabelling()}
         relabelled = stages.do("relabel", "relabel: segments to skills", settings, [data, self.skill], self._relabel)
         if last < 3:
             return
         self.relabelled = relabelled
-        steps = self.settings["policy"]["trainer"]["max_steps"]
+        steps = self.trainings.settings["policy"]["trainer"]["max_steps"]
         title = f"policy: {steps:,} steps"
         reads = [data, self.skill, relabelled]
-        self.policy = stages.do("policy", title, self._essence("policy"), reads, self._policy)
+        self.policy = stages.do("policy", title, self.trainings.essence("policy"), reads, self._policy)
         if last < 4:
             return
         title = f"clone: behaviour cloning, the baseline, {w.clone_steps:,} steps"
@@ -153,67 +144,49 @@ class Run:
 
     def _data(self, folder: Path, resuming: bool) -> dict[str, Any]:
         """Collect data, or look at what was given."""
-        from datamodules.inspection import check_dataset
+        from datamodules.inspection import describe
+        from datamodules.sources import load_trajectories
+        from dds_lightning.study.diagnosis import behaviour_scores
 
         made: dict[str, Any] = {}
         spec = self.wanted.data
         if spec is None:
-            from datamodules.collect.pointmaze import collect_pointmaze
+            from datamodules.collect.collectors import collect
 
             w = self.wanted
-            made["data"] = collect_pointmaze(
+            made["data"] = collect(
                 self.task, w.data_steps, w.seed, folder, w.workers, dataset_id=self.task.name, overwrite=True
             )
             spec = f"local:{made['data']}"
-        facts = check_dataset(spec, self.task)
-        return {**made, "facts": facts}
-
-    def _words(self, stage: str, spec: str) -> list[str]:
-        """The words of `dds STAGE fit` for this run."""
-        w, folder = self.wanted, self.out / stage
-        words = ["fit", "--config", str(self.preset[stage])]
-        words += [f"--seed_everything={w.seed}", f"--data.seed={w.seed}"]
-        words += [f"--data.task={self.task.name}", f"--data.data={spec}"]
-        if stage == "policy":
-            skill = getattr(self, "skill", None)
-            checkpoint = skill.outputs["checkpoint"] if skill else self.out / "skill" / "last.ckpt"
-            words += [f"--data.skill={checkpoint}", f"--data.cache={self.out / 'relabel'}"]
-        words += [f"--trainer.default_root_dir={folder}", f"--checkpoint.dirpath={folder}"]
-        return [*words, "--trainer.enable_model_summary=false", *getattr(w, stage)]
-
-    def _essence(self, stage: str) -> dict[str, Any]:
-        """The settings that a training's result depends on: all of them but the places of files."""
-        config = self.settings[stage]
-        trainer = {key: value for key, value in config["trainer"].items() if key not in _PLACES}
-        data = {key: value for key, value in config["data"].items() if key not in ("data", "skill", "cache")}
-        chosen = {"trainer": trainer, "model": config["model"], "data": data, "best": config["best"]}
-        return {"seed": config["seed_everything"], **chosen}
+        trajectories = load_trajectories(spec, self.task)
+        facts, _ = describe(trajectories, task=self.task)
+        return {**made, "facts": facts, "scores": behaviour_scores(trajectories, self.task)}
 
     def _fit(self, stage: str, folder: Path, resuming: bool) -> dict[str, Any]:
         """Run `dds STAGE fit`, from its last checkpoint if there is one."""
         from dds_lightning.training.fitting import StageCLI, command_line
 
-        words = self._words(stage, self.spec)
+        skill = self.skill.outputs["checkpoint"] if stage == "policy" else None
+        words = self.trainings.words(stage, self.spec, skill)
         if resuming and (folder / "last.ckpt").is_file():
             words += [f"--ckpt_path={folder / 'last.ckpt'}", "--model.init_from=null"]
         self.console.print(command_line(stage, words), style="dim", highlight=False, soft_wrap=True)
         made = StageCLI(stage, words).execute().data
         metrics = {name: round(value, 6) for name, value in made["metrics"].items()}
-        return {
-            "checkpoint": Path(made["best"] or made["checkpoint"]),
-            "steps": made["steps"],
-            "metrics": metrics,
-        }
+        paths = {name: Path(made[name]) for name in ("checkpoint", "best") if made[name]}
+        return {**paths, "steps": made["steps"], "metrics": metrics}
 
     def _skill(self, folder: Path, resuming: bool) -> dict[str, Any]:
-        return self._fit("skill", folder, resuming)
+        """A best checkpoint is kept only on request, and then it is the one that was asked for."""
+        made = self._fit("skill", folder, resuming)
+        checkpoint = made.pop("best", made["checkpoint"])
+        return {**made, "checkpoint": checkpoint}
 
     def _policy(self, folder: Path, resuming: bool) -> dict[str, Any]:
-        return self._fit("policy", folder, resuming)
-
-    def _relabelling(self) -> dict[str, Any]:
-        names = ("gamma", "discount", "stride", "reward_scale", "reward_shift")
-        return {name: self.settings["policy"]["data"][name] for name in names}
+        """The last checkpoint is what the run is about; the best is told beside it."""
+        made = self._fit("policy", folder, resuming)
+        chosen = {"chosen": protocol.best_facts(made["checkpoint"], made["best"])} if "best" in made else {}
+        return {**made, **chosen}
 
     def _relabel(self, folder: Path, resuming: bool) -> dict[str, Any]:
         """Fill the cache that `dds policy fit` reads."""
@@ -225,7 +198,7 @@ class Run:
             self.spec,
             str(self.skill.outputs["checkpoint"]),
             cache=str(folder),
-            **self._relabelling(),
+            **self.trainings.relabelling(),
         )
         module.prepare_data()
         summary = Relabelled.load(module.cache_file()).summary()
@@ -243,18 +216,21 @@ class Run:
         """Publish the agent and let everyone in the table play."""
         from dds_lightning.agent import DDSAgent
         from dds_lightning.policy import PolicyModule
+        from dds_lightning.reports import plain
         from dds_lightning.rollout import rollout
         from dds_lightning.skill import SkillModule
         from dds_lightning.study.baselines import CloneActor
 
         w = self.wanted
-        agent = DDSAgent(
-            SkillModule.load(self.skill.outputs["checkpoint"]),
-            PolicyModule.load(self.policy.outputs["checkpoint"]),
-            selection=w.selection,  # type: ignore[arg-type]
-            temperature=w.temperature,
-            seed=w.seed,
-        )
+        chosen: dict[str, Any] = self.policy.facts.get("chosen", {})
+        skill = SkillModule.load(self.skill.outputs["checkpoint"])
+
+        def agent_of(checkpoint: str) -> DDSAgent:
+            policy = PolicyModule.load(self.policy.outputs[checkpoint])
+            return DDSAgent(skill, policy, w.selection, w.temperature, seed=w.seed)  # type: ignore[arg-type]
+
+        agent = agent_of("checkpoint")
+        best = agent_of("best") if chosen else None
         players = contestants.final_table(
             agent,
             self.task,
@@ -262,17 +238,24 @@ class Run:
             w.episodes_per_skill,
             clone=CloneActor.load(self.clone.outputs["checkpoint"]),
             controller=contestants.behaviour_controller(self.task) if w.data is None else None,
+            best=contestants.best_ways(best, self.episodes, chosen) if best else (),
         )
         result = rollout(self.task, players, seed=w.seed, workers=w.workers, record=True)
         result.save(folder)
-        summary = result.summary()
-        published = agent.save(
-            self.out / "agent",
-            metrics={"episodes": self.episodes, "seed": w.seed, "results": _records(summary)},
-            card=self._card(result.episodes),
-            task=self.task.name,
+        how = protocol.protocol(
+            self.task, agent, episodes=self.episodes, seed=w.seed, temperature=w.temperature, best=chosen
         )
-        return {"episodes": folder / "episodes.parquet", "agent": published, "results": _records(summary)}
+        made: dict[str, Any] = {"protocol": how}
+        made["start_value"] = plain(protocol.start_value(self.task, agent, w.seed))
+        results = _records(result.summary())
+        metrics = {"episodes": self.episodes, "seed": w.seed, "results": results}
+        card = self._card(result.episodes)
+        made["agent"] = agent.save(self.out / "agent", metrics=metrics, card=card, task=self.task.name)
+        if best:
+            made["best"] = best.save(
+                self.out / contestants.BEST_AGENT, metrics=metrics, task=self.task.name, checkpoint=chosen
+            )
+        return {"episodes": folder / "episodes.parquet", **made, "results": results}
 
     def _card(self, episodes: Any) -> str:
         """The README.md of the published agent."""
@@ -287,7 +270,7 @@ class Run:
             episodes,
             seed=w.seed,
             data={"source": w.data or made, **self.data_facts},
-            settings=self.settings,
+            settings=self.trainings.settings,
             command=shlex.join(words),
         )
 
@@ -328,24 +311,3 @@ class Run:
 def _records(frame: Any) -> list[dict[str, Any]]:
     """Rows as plain numbers, rounded so that a marker is readable; NaN becomes None."""
     return json.loads(frame.round(4).to_json(orient="records"))
-
-
-def _signature(spec: str | None) -> str | None:
-    """Tell given data from changed ones without reading them: names, sizes and times of the files.
-
-    Raises:
-        UserError: there is no such folder.
-    """
-    if spec is None:
-        return None
-    source, _, rest = spec.partition(":")
-    folder = Path(rest)
-    if source == "minari":
-        from datamodules.sources.minari import minari_root
-
-        folder = minari_root() / rest
-    if not rest or not folder.exists():
-        raise UserError(f"data: there is nothing at {folder} (from {spec!r}); expected local:DIR or minari:ID")
-    files = sorted(entry for entry in folder.rglob("*") if entry.is_file())
-    facts = [(str(f.relative_to(folder)), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
-    return hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:16]

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.error
 import warnings
 from pathlib import Path
 
@@ -99,9 +100,33 @@ def test_the_version_is_printed(dds):
 
 def test_tasks_are_listed_for_people_and_for_programs(dds):
     assert all(name in dds("tasks").out for name in task_names())
-    rows = dds("tasks", "--json").json
-    assert [row["task"] for row in rows] == list(task_names())
-    assert rows[0]["paper"] is None  # a missing number is null, not NaN, which is no JSON
+    rows = {row["task"]: row for row in dds("tasks", "--json").json}
+    assert list(rows) == list(task_names())
+    assert rows["hopper-medium-replay"]["paper"] == 84.6
+    assert rows[TASK]["paper"] is None  # a missing number is null, not NaN, which is no JSON
+
+
+def test_the_table_of_tasks_fits_a_terminal_of_100_columns(dds):
+    lines = [line.rstrip() for line in dds("tasks").out.splitlines()]
+    rows = [line for line in lines if line.split() and line.split()[0] in task_names()]
+    assert len(rows) == len(task_names())
+    assert max(map(len, rows)) <= 100
+
+
+def test_one_task_is_told_in_full(dds):
+    told = dds("tasks", "antmaze-medium-diverse").out
+    for fact in ("0.1 * (r - 1)", "row 6, column 6, at x 20 m, y 20 m", "within 0.5 m", "d4rl:antmaze-medium-diverse"):
+        assert fact in told
+    for fact in ("torque of +-30 N m", "torque of +-150 N m", "D4RL's data", "89.1", "hip 4", "1000 steps of 0.1 s"):
+        assert fact in told
+    maze = told.splitlines()[-8:]
+    assert maze[1] == "##S   ####    ##"
+    assert maze[6] == "##      ##  G ##"
+    row = dds("tasks", "antmaze-medium-diverse@robotics", "--json").json
+    assert row["start"] == {"cell": [1, 1], "xy": [-10, 10]}
+    assert row["variants"]["antmaze-medium-diverse"]["seconds a step"] == 0.1
+    assert row["variants"]["antmaze-medium-diverse@robotics"]["seconds a step"] == row["seconds a step"] == 0.05
+    refused(dds("tasks", "antmaze-medium"), "antmaze-medium", "antmaze-medium-play")
 
 
 @pytest.mark.parametrize("words", [[], ["data"], ["run"], ["skill"], ["policy"], ["relabel"], ["evaluate"]])
@@ -129,7 +154,13 @@ def test_every_command_explains_itself(dds, words):
         (["evaluate", "nowhere"], ["nowhere"]),
         (["report", "nowhere"], ["nowhere"]),
         (["data", "check", "nowhere"], ["nowhere"]),
+        (["data", "check", "nowhere.hdf5"], ["nowhere.hdf5", "d4rl:FILE"]),
         (["data", "collect", "nope"], ["nope"]),
+        (["data", "collect", "kitchen-mixed"], ["kitchen-mixed", "pointmaze", "dds data fetch kitchen-mixed"]),
+        (["data", "fetch", "nope"], ["nope"]),
+        (["data", "fetch", TASK], [TASK, "d4rl", "minari:"]),
+        (["data", "fetch", TASK, "--source", "here"], ["here", "dds data fetch --help"]),
+        (["data", "show", "nowhere"], ["nowhere"]),
         (["skill", "nonsense"], ["nonsense"]),
         (["skill", "fit", "--config", "nope.yaml"], ["nope.yaml", "pointmaze/skill.yaml"]),
         (["skill", "fit", "--data.task", "nope"], ["nope"]),
@@ -153,12 +184,59 @@ def test_sound_data_are_described(dds, data):
     assert "is sound" in dds("data", "check", f"local:{data}").out
 
 
-def test_data_are_listed_and_shown(dds, data):
+def test_data_are_listed_with_the_task_they_fit(dds, data):
     (row,) = dds("data", "list", "--root", f"[{data.parent}]", "--json").json
     assert row["steps"] == 2000
-    shown = dds("data", "show", data, "--episodes", 1, "--json").json
+    assert row["tasks"] == [TASK]
+    assert row["data"] == f"local:{data}"
+    assert f"local:{data}" in dds("data", "list", "--root", f"[{data.parent}]").out.replace("\n", "")
+    assert "dds data collect" in dds("data", "list").out
+
+
+def test_data_are_shown_in_tables_and_a_figure(dds, data):
+    shown = dds("data", "show", data, "--task", TASK, "--episodes", 1, "--json").json
+    assert [d["name"] for d in shown["dimensions"]][:2] == ["x (m)", "y (m)"]
     assert [d["dimension"] for d in shown["dimensions"]][-2:] == ["action 0", "action 1"]
     assert len(shown["episodes"]) == 1
+    assert shown["figure"] == f"show/{TASK}-v0.png"
+    assert files() == [shown["figure"]]
+    assert Path(shown["figure"]).read_bytes().startswith(b"\x89PNG")
+    answer = dds("data", "show", data, "--out", "mine.pdf")
+    assert "x velocity" not in answer.out
+    assert f"it may be {TASK}" in answer.out
+    assert Path("mine.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_a_figure_is_drawn_only_where_it_can_be_and_is_wanted(dds, data):
+    assert dds("data", "show", data, "--no_figure", "--json").json["figure"] is None
+    refused(dds("data", "show", data, "--out", "figure.doc"), "figure.doc", ".png")
+    refused(dds("data", "show", data, "--episodes", -1), "--episodes", "-1")
+    assert files() == []
+
+
+def test_fetching_without_a_network_is_one_sentence(dds, monkeypatch):
+    monkeypatch.setattr("datamodules.sources.download.PAUSE", 0.0)
+    monkeypatch.setattr("urllib.request.OpenerDirector.open", _no_network)
+    refused(
+        dds("data", "fetch", "kitchen-mixed", "--out", "here"), "kitchen_microwave_kettle_bottomburner_light-v0.hdf5"
+    )
+    assert files() == []
+
+
+def _no_network(*_, **__):
+    raise urllib.error.URLError("name or service not known")
+
+
+def test_what_was_fetched_is_said_as_it_is_typed(dds, monkeypatch):
+    def fetch(task, source, out):
+        Path(out).mkdir()
+        path = Path(out) / "file.hdf5"
+        path.write_bytes(b"")
+        return path
+
+    monkeypatch.setattr("datamodules.sources.fetch.fetch", fetch)
+    answer = dds("data", "fetch", "kitchen-mixed", "--out", "here", "--json").json
+    assert (answer["task"], answer["source"], answer["data"]) == ("kitchen-mixed", "d4rl", "d4rl:here/file.hdf5")
 
 
 def test_data_of_another_task_are_refused_everywhere(dds, data):

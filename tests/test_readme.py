@@ -8,12 +8,14 @@ from pathlib import Path
 
 import pytest
 
+from datamodules import load_trajectories
 from dds_lightning.cli import main
 from dds_lightning.cli.parser import build_parser, prepare
 from dds_lightning.training.fitting import settings_of
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
+PYTHON = re.findall(r"^```python\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL)
 BLOCKS = re.findall(r"^```bash\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL)
 LINES = [line for block in BLOCKS for line in block.replace("\\\n", " ").splitlines() if line.strip()]
 LINES = [line for line in LINES if not line.startswith("#")]
@@ -59,5 +61,13 @@ def test_every_file_that_readme_links_to_exists():
 
 
 def test_python_blocks_are_valid_python():
-    for block in re.findall(r"^```python\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL):
+    for block in PYTHON:
         compile(block, "README.md", "exec")
+
+
+def test_own_arrays_become_data_of_a_task_as_shown():
+    (block,) = [block for block in PYTHON if "from_episodes" in block]
+    exec(compile(block, "README.md", "exec"), {})
+    data = load_trajectories("arrays:data/mine", "hopper-medium")
+    assert (data.num_steps, data.num_episodes) == (200, 1)
+    assert main(["data", "check", "data/mine", "--task", "hopper-medium"]) == 0

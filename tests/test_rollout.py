@@ -44,6 +44,7 @@ TOY = SimpleNamespace(
     observation_dim=2,
     action_dim=1,
     max_episode_steps=6,
+    measures_success=True,
     make_env=CountEnv,
     normalised_score=lambda returns: 100.0 * returns,
 )
@@ -172,6 +173,29 @@ def test_summary_counts_by_hand():
     assert summary["score_error"][0] == pytest.approx(50.0)
     assert summary["length_success"].tolist() == [10.0, 20.0]
     assert RolloutResult("toy", table).summary("label")["label"].tolist() == ["x", "y", "a"]
+
+
+RUNNER = SimpleNamespace(**{**vars(TOY), "name": "hopper-medium", "measures_success": False})
+
+
+def test_a_task_that_measures_no_success_has_none_on_disk_and_in_its_summary(tmp_path):
+    result = rollout(RUNNER, [Contestant("c", Constant(2.0), 5)], workers=0)
+    assert str(result.episodes["success"].dtype) == "boolean"
+    result.save(tmp_path)
+    again = RolloutResult.load(tmp_path)
+    assert again.episodes["success"].isna().all()
+    for table in (result, again):
+        row = table.summary().iloc[0]
+        assert np.isnan([row["success"], row["length_success"]]).all()
+        assert (row["score"], row["score_error"], row["return"], row["length"]) == (200.0, 0.0, 2.0, 1.0)
+
+
+def test_a_table_of_plain_bools_is_read_as_ever(tmp_path):
+    """What earlier versions wrote."""
+    result = rollout(TOY, [Contestant("c", Constant(2.0), 2)], workers=0)
+    assert result.episodes["success"].dtype == bool
+    result.save(tmp_path)
+    assert RolloutResult.load(tmp_path).summary()["success"].tolist() == [100.0]
 
 
 def _maze_table(workers, slots=30):
@@ -358,6 +382,14 @@ def test_an_interrupt_while_acting_ends_the_workers(monkeypatch):
         rollout(UMAZE, [Contestant("i", Interrupted(2), 8)], workers=2)
     assert len(pids) == 2
     assert _children_gone(pids)
+
+
+def test_progress_tells_the_score_where_success_is_not_measured(monkeypatch, capsys):
+    monkeypatch.setattr("rich.console.Console.is_terminal", property(lambda self: True))
+    rollout(RUNNER, [Contestant("a", Constant(0.5), 1), Contestant("b", Constant(1.5), 1)], workers=0)
+    said = capsys.readouterr().err
+    assert "score " in said
+    assert "success" not in said
 
 
 @pytest.mark.parametrize(("terminal", "wanted"), [(True, True), (True, False), (False, True)])

@@ -1,6 +1,7 @@
 """`dds run` from collecting to the report on the smallest maze, in-process: what is made, skipped and resumed."""
 
 import contextlib
+import dataclasses
 import json
 import os
 import signal
@@ -16,6 +17,8 @@ import torch
 from dds_lightning import DDSAgent
 from dds_lightning.cli import main
 from dds_lightning.errors import UserError
+from dds_lightning.run_settings import RunSettings, Trainings
+from dds_lightning.study import report
 from dds_lightning.study.contestants import EveryRow, final_table, way_name
 from dds_lightning.tasks import get_task
 
@@ -88,6 +91,10 @@ def test_evaluating_a_run_prints_a_row_for_each_way_of_choosing(finished, capsys
     assert main([*words, "--out=table.parquet"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert [row["actor"] for row in said["results"]] == ["AWR policy, greedy", "random skills"]
+    assert {row["checkpoint"] for row in said["results"]} == {"last"}
+    how = said["protocol"]
+    assert (how["task"], how["environment"], how["episodes"], how["best"]) == (TASK, "PointMaze_UMaze-v3", 2, None)
+    assert (how["score_min"], how["score_max"], how["paper_score"]) == (0.0, 1.0, None)
     assert len(pd.read_parquet("table.parquet")) == 4
 
 
@@ -170,6 +177,86 @@ def test_a_run_with_another_tasks_data_stops_at_the_first_stage(finished, capsys
     assert main(["run", "pointmaze-large-diverse", "--out", "run", "--data", data]) == 2
     assert "PointMaze_Large-v3" in capsys.readouterr().err
     assert not Path("run/skill").exists()
+
+
+# -------------------------------------------------------------------- the best checkpoint beside the last
+
+
+def test_the_best_policy_is_told_beside_the_last_and_leaves_when_it_is_not_wanted(
+    finished, capsys, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(report, "_draw", lambda *arguments: {})  # what is drawn is for other tests
+    out = tmp_path / "run"
+    given = [*SMALL, f"--data=local:{finished / 'data' / TASK}", "--out", out]
+    _, said, err = call(capsys, *given, "--evaluate_every=10")
+    assert "--best.monitor=rollout/score" in err
+    best = said["protocol"]["best"]
+    assert (best["monitor"], best["evaluations"]) == ("rollout/score", 2)
+    assert best["step"] in (10, 20)
+    names = [row["contestant"] for row in said["table"]]
+    assert names[0] == "AWR policy, sampled"
+    label = f"(best of 2 evaluations while training, step {best['step']}: optimistic)"
+    assert [name for name in names if label in name] == [f"AWR policy, sampled {label}", f"AWR policy, greedy {label}"]
+    assert DDSAgent.load(out / "evaluate" / "best").policy is not None
+    last, kept = (torch.load(out / "policy" / f"{name}.ckpt", weights_only=True) for name in ("last", "best"))
+    assert (last["global_step"], kept["global_step"]) == (20, best["step"])
+    untouched = torch.load(finished / "policy" / "last.ckpt", weights_only=True)["state_dict"]
+    assert all(torch.equal(last["state_dict"][name], untouched[name]) for name in untouched)  # watching changes no bit
+
+    _, said, err = call(capsys, *given, "--evaluate_every=10", "--workers=0")
+    assert said["done_before"] == STAGES  # how many processes play changes nothing
+    _, said, _ = call(capsys, *given)
+    assert said["done_before"] == ["data", "skill", "relabel", "clone"]
+    assert said["protocol"]["best"] is None
+    assert not (out / "evaluate" / "best").exists()
+
+
+def test_a_run_without_a_best_says_so(finished, capsys):
+    assert main(["evaluate", str(finished), "--checkpoint=best"]) == 2
+    assert "holds only the last one" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("task", "every", "steps", "found"),
+    [
+        (TASK, None, 20, 0),
+        (TASK, 5, 20, 5),
+        ("hopper-medium", None, 20, 5),
+        ("hopper-medium", None, 3, 1),
+        ("antmaze-umaze", 0, 20, 0),
+        ("kitchen-mixed", None, 10_000, 2500),
+    ],
+)
+def test_the_policy_is_evaluated_four_times_except_where_the_maze_is_easy(task, every, steps, found):
+    wanted = RunSettings(task, Path("out"), evaluate_every=every, policy=(f"--trainer.max_steps={steps}",))
+    trainings = Trainings(wanted, get_task(task))
+    assert trainings.evaluate_every == found
+    settings = trainings.settings["policy"]
+    assert settings["best"]["monitor"] == ("rollout/score" if found else None)
+    assert settings["best"]["every_n_steps"] == (found or None)
+    callbacks = [callback["init_args"] for callback in settings["trainer"]["callbacks"] or []]
+    assert [(chosen["every_n_steps"], chosen["episodes"], chosen["seed"]) for chosen in callbacks] == (
+        [(found, 10, 1)] if found else []
+    )
+    other = Trainings(dataclasses.replace(wanted, workers=3), get_task(task))
+    assert other.essence("policy") == trainings.essence("policy")
+    assert set(trainings.essence("skill")["best"]) == {"monitor", "mode"}  # runs of earlier versions are still done
+
+
+@pytest.mark.parametrize("every", [-1, 21])
+def test_an_interval_that_cannot_work_is_refused_before_anything_is_written(capsys, every):
+    words = [*SMALL, f"--evaluate_every={every}"]
+    assert main(["run", TASK, *words]) == 2
+    assert f"--evaluate_every is {every}, expected 0 (never) to 20" in capsys.readouterr().err
+    assert list(Path().iterdir()) == []
+
+
+def test_a_task_that_nothing_collects_asks_for_data_before_anything_is_written(capsys, monkeypatch):
+    monkeypatch.setattr("datamodules.collect.collectors.COLLECTORS", {})
+    assert main(["run", "hopper-medium"]) == 2
+    said = capsys.readouterr().err
+    assert all(part in said for part in ("hopper-medium", "d4rl:FILE", "minari:ID", "dds data fetch hopper-medium"))
+    assert list(Path().iterdir()) == []
 
 
 # -------------------------------------------------------------------- who plays

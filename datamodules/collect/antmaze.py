@@ -12,15 +12,18 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.behaviours.ant import AntController
+from datamodules.behaviours.ant import SHIPPED, AntController
 from datamodules.collect.minari_writer import write_minari
 from datamodules.collect.recording import Episode, Kept, record
 from datamodules.collect.waypoints import Waypoints
 from datamodules.storage import refuse_existing
 from dds_lightning.envs.build import build_env
 from dds_lightning.errors import UserError
+from dds_lightning.files import sha256
 from dds_lightning.tasks import Cell, Task, get_task
 
+BODIES = 16
+"""Ants that walk side by side in one process; belongs to the data, like the seed."""
 FLIPPED_STEPS = 25
 """An ant that lies on its back this long has fallen for good (it takes a few steps to roll over a leg)."""
 
@@ -107,7 +110,7 @@ def collect_antmaze(
         "seed": seed,
         "steps": steps,
         **asdict(recipe),
-        "controller": recorder.controller.fingerprint,
+        "controller": sha256(SHIPPED / "ant" / f"{task.physics}.safetensors"),
     }
     kept = Kept(folder, made_from)
     kept.open()
@@ -116,7 +119,7 @@ def collect_antmaze(
     write_minari(
         out,
         name,
-        record(recorder, workers, kept=kept, title=f"collecting {name}" if progress else None),
+        record(recorder, workers, parcel=1, kept=kept, title=f"collecting {name}" if progress else None),
         env_spec=env.spec,
         observation_space=gym.spaces.Box(-np.inf, np.inf, (task.observation_dim,), np.float32),
         action_space=env.action_space,
@@ -134,94 +137,128 @@ def collect_antmaze(
 
 
 class _Recorder:
-    """Records round i of a data set, `episode_steps` steps; everything about it follows from (seed, i)."""
+    """Records round i of a data set: some bodies walk side by side, so that the controller acts in one batch.
+
+    Everything about a round follows from (seed, i).
+    """
 
     def __init__(self, task: Task, seed: int, steps: int, recipe: AntMazeRecipe) -> None:
         self.task, self.seed, self.steps, self.recipe = task, seed, steps, recipe
-        self.rounds = -(-steps // recipe.episode_steps)
-        self.controller = AntController.load()
+        self.rounds = -(-steps // (BODIES * recipe.episode_steps))
+        self.controller = AntController(task.physics)
+        self._envs: list[gym.Env[Any, Any]] = []
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_envs": []}  # each process makes its own
+
+    def env(self, body: int = 0) -> gym.Env[Any, Any]:
+        while len(self._envs) <= body:
+            self._envs.append(build_env(self.task.env_id, max_episode_steps=self.recipe.episode_steps))
+        return self._envs[body]
+
+    def __call__(self, number: int) -> list[Episode]:
+        each = self.recipe.episode_steps
+        left = self.steps - number * BODIES * each
+        walks = []
+        for body in range(min(BODIES, -(-left // each))):
+            rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number, body)))
+            walks.append(_Walk(self.task, self.recipe, self.env(body).unwrapped, rng, min(each, left - body * each)))
+        while walking := [walk for walk in walks if walk.left]:
+            states = np.stack([walk.state for walk in walking])
+            headings = np.array([walk.heading() for walk in walking])
+            for walk, action in zip(walking, self.controller.act(states, headings), strict=True):
+                walk.step(action)
+        return [episode for walk in walks for episode in walk.episodes]
+
+
+class _Walk:
+    """One body on its way for a number of steps, in one episode or, where some end early, in more."""
+
+    def __init__(self, task: Task, recipe: AntMazeRecipe, env: Any, rng: np.random.Generator, steps: int) -> None:
+        self.task, self.recipe, self.env, self.rng, self.left = task, recipe, env, rng, steps
         self.waypoints = Waypoints(task)
         # With one goal there is nowhere else to go: the episode ends there, as in D4RL's `antmaze-umaze`.
         self.ends_at_goal = len(task.data_goal_cells or ()) == 1
-        self._env: gym.Env[Any, Any] | None = None
+        self.episodes: list[Episode] = []
+        self._begin()
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_env": None}  # each process makes its own
-
-    def env(self) -> gym.Env[Any, Any]:
-        if self._env is None:
-            self._env = build_env(self.task.env_id, max_episode_steps=self.recipe.episode_steps)
-        return self._env
-
-    def __call__(self, number: int) -> list[Episode]:
-        rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number,)))
-        left = min(self.recipe.episode_steps, self.steps - number * self.recipe.episode_steps)
-        episodes: list[Episode] = []
-        while left:
-            episodes.append(self._episode(rng, left))
-            left -= len(episodes[-1]["rewards"])
-        return episodes
-
-    def _episode(self, rng: np.random.Generator, length: int) -> Episode:
-        """At most `length` steps."""
-        task, recipe = self.task, self.recipe
-        env: Any = self.env().unwrapped
-        env.reset(seed=int(rng.integers(2**31)))
-        evaluation_goal = env.goal.copy()
-        state = self._placed(env, _draw(rng, task.data_start_cells or task.free_cells()))
-        noise = recipe.action_noise * rng.standard_normal((length, task.action_dim))
-        offsets = (rng.uniform(0.0, 1.0, (length, 2)) * recipe.waypoint_noise).tolist()
-
-        observations = np.empty((length + 1, task.observation_dim), np.float32)
-        actions = np.empty((length, task.action_dim), np.float32)
-        goals = np.empty((length + 1, 2), np.float32)
+    def _begin(self) -> None:
+        """Start an episode that may take all the steps that are left."""
+        task, recipe, env, length = self.task, self.recipe, self.env, self.left
+        env.reset(seed=int(self.rng.integers(2**31)))
+        self.evaluation_goal = env.goal.copy()
+        self.state = self._placed(_draw(self.rng, task.data_start_cells or task.free_cells()))
+        self.noise = recipe.action_noise * self.rng.standard_normal((length, task.action_dim))
+        self.offsets = (self.rng.uniform(0.0, 1.0, (length, 2)) * recipe.waypoint_noise).tolist()
+        self.observations = np.empty((length + 1, task.observation_dim), np.float32)
+        self.actions = np.empty((length, task.action_dim), np.float32)
+        self.goals = np.empty((length + 1, 2), np.float32)
+        self.t = self.on_back = 0
         self.waypoints.forget()
-        goal = self._new_goal(rng, state)
-        observations[0], goals[0] = state, goal
-        on_back = 0
-        for t in range(length):
-            actions[t] = np.clip(self._action(state, goal, offsets[t]) + noise[t], -1.0, 1.0)
-            state = env.step(actions[t])[0]
-            observations[t + 1], goals[t + 1] = state, goal
-            there = math.hypot(state[0] - goal[0], state[1] - goal[1]) <= task.goal_radius
-            if there and not self.ends_at_goal:
-                goals[t + 1] = goal = self._new_goal(rng, state)
-            # The body's z axis in the world, from the quaternion (w, x, y, z).
-            on_back = on_back + 1 if 1.0 - 2.0 * (state[4] ** 2 + state[5] ** 2) < 0.0 else 0
-            if (there and self.ends_at_goal) or (recipe.end_when_flipped and on_back >= FLIPPED_STEPS):
-                length = t + 1
-                break
-        near = np.linalg.norm(observations[1 : length + 1, :2] - evaluation_goal, axis=1) <= task.goal_radius
+        self.goal = self._new_goal()
+        self.observations[0], self.goals[0] = self.state, self.goal
+
+    def heading(self) -> float:
+        """Where to walk now, in radians."""
+        x, y = float(self.state[0]), float(self.state[1])
+        offset = self.offsets[self.t]
+        target_x, target_y = self.waypoints.target(x, y, self.goal, (offset[0], offset[1]))
+        return math.atan2(target_y - y, target_x - x)
+
+    def step(self, action: NDArray[np.float64]) -> None:
+        """Act once, with noise; where the episode ends, begin the next."""
+        self.actions[self.t] = np.clip(action + self.noise[self.t], -1.0, 1.0)
+        self.state = self.env.step(self.actions[self.t])[0]
+        self.t, self.left = self.t + 1, self.left - 1
+        there = math.hypot(self.state[0] - self.goal[0], self.state[1] - self.goal[1]) <= self.task.goal_radius
+        if there and not self.ends_at_goal:
+            self.goal = self._new_goal()
+        self.observations[self.t], self.goals[self.t] = self.state, self.goal
+        # The body's z axis in the world, from the quaternion (w, x, y, z).
+        upright = 1.0 - 2.0 * (self.state[4] ** 2 + self.state[5] ** 2) > 0.0
+        self.on_back = 0 if upright else self.on_back + 1
+        fallen = self.recipe.end_when_flipped and self.on_back >= FLIPPED_STEPS
+        if (there and self.ends_at_goal) or fallen or not self.left:
+            self.episodes.append(self._episode())
+            if self.left:
+                self._begin()
+
+    def _episode(self) -> Episode:
+        length = self.t
+        observations = self.observations[: length + 1].copy()
+        near = np.linalg.norm(observations[1:, :2] - self.evaluation_goal, axis=1) <= self.task.goal_radius
         return {
-            "observations": observations[: length + 1],
-            "actions": actions[:length],
+            "observations": observations,
+            "actions": self.actions[:length].copy(),
             "rewards": near.astype(np.float32),
             "terminations": np.zeros(length, bool),
             "truncations": np.arange(length) == length - 1,
-            "infos": {"goal": goals[: length + 1], "evaluation_goal": np.tile(evaluation_goal, (length + 1, 1))},
+            "infos": {
+                "goal": self.goals[: length + 1].copy(),
+                "evaluation_goal": np.tile(self.evaluation_goal, (length + 1, 1)),
+            },
         }
 
-    def _action(self, state: NDArray[np.float64], goal: tuple[float, float], offset: list[float]) -> Any:
-        x, y = float(state[0]), float(state[1])
-        target_x, target_y = self.waypoints.target(x, y, goal, (offset[0], offset[1]))
-        return self.controller.act(state[None], np.array([math.atan2(target_y - y, target_x - x)]))[0]
-
-    def _placed(self, env: Any, cell: Cell) -> NDArray[np.float64]:
+    def _placed(self, cell: Cell) -> NDArray[np.float64]:
         """Move the body from the start cell to another, with the noise that the reset gave it."""
-        qpos = env.data.qpos.copy()
+        data = self.env.data
+        qpos = data.qpos.copy()
         qpos[:2] += self.task.cell_to_xy(cell)  # the start cell is the origin
-        env.set_state(qpos, env.data.qvel.copy())
-        return np.concatenate([env.data.qpos[:15], env.data.qvel[:14]])
+        self.env.set_state(qpos, data.qvel.copy())
+        return np.concatenate([data.qpos[:15], data.qvel[:14]])
 
-    def _new_goal(self, rng: np.random.Generator, state: NDArray[np.float64]) -> tuple[float, float]:
+    def _new_goal(self) -> tuple[float, float]:
         """A goal in another cell than the body's, with the evaluation's noise."""
-        task = self.task
-        here = task.xy_to_cell(state[:2])
-        cells = task.data_goal_cells or task.free_cells()
-        elsewhere = [cell for cell in cells if self.ends_at_goal or tuple(here) != cell]
-        noise = rng.uniform(0.0, 1.0, 2) + rng.uniform(0.0, 0.5, 2)
-        x, y = (task.cell_to_xy(_draw(rng, elsewhere)) + noise).tolist()
-        return x, y
+        here = tuple(self.task.xy_to_cell(self.state[:2]).tolist())
+        cells = self.task.data_goal_cells or self.task.free_cells()
+        elsewhere = [cell for cell in cells if self.ends_at_goal or cell != here]
+        return _goal_near(self.task, _draw(self.rng, elsewhere), self.rng)
+
+
+def _goal_near(task: Task, cell: Cell, rng: np.random.Generator) -> tuple[float, float]:
+    """A goal in a cell, where the evaluation would draw it."""
+    x, y = (task.cell_to_xy(cell) + rng.uniform(0.0, 1.0, 2) + rng.uniform(0.0, 0.5, 2)).tolist()
+    return x, y
 
 
 def _draw(rng: np.random.Generator, cells: Any) -> Cell:
@@ -247,7 +284,7 @@ class AntNavigator:
         """Prepare for `task`; without a recipe the controller is at its best, without noise on actions."""
         self.task = get_task(task) if isinstance(task, str) else task
         self.recipe = recipe or AntMazeRecipe(action_noise=0.0)
-        self.controller = AntController.load()
+        self.controller = AntController("d4rl")
         self.codes: NDArray[np.int64] | None = None
         self.reset()
 
@@ -260,9 +297,7 @@ class AntNavigator:
     def _goal(self) -> tuple[float, float]:
         """Somewhere among the evaluation's goals, which an actor is not shown."""
         assert self.task.goal_cell is not None
-        noise = self._rng.uniform(0.0, 1.0, 2) + self._rng.uniform(0.0, 0.5, 2)
-        x, y = (self.task.cell_to_xy(self.task.goal_cell) + noise).tolist()
-        return x, y
+        return _goal_near(self.task, self.task.goal_cell, self._rng)
 
     def act(self, observations: NDArray[np.float32], restarted: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
         """Actions for a batch.

@@ -30,8 +30,6 @@ from dds_lightning.errors import UserError
 from dds_lightning.files import written_whole
 
 Episode = dict[str, Any]
-PARCEL = 4
-"""Rounds that a worker fetches at once; has no influence on the data."""
 
 
 class EpisodeRecorder(Protocol):
@@ -50,6 +48,7 @@ def record(
     recorder: EpisodeRecorder,
     workers: int | None = None,
     *,
+    parcel: int = 4,
     kept: Kept | None = None,
     title: str | None = None,
 ) -> Iterator[Episode]:
@@ -58,6 +57,7 @@ def record(
     Args:
         recorder: What records them.
         workers: Processes; None takes every core, 1 stays in this process.
+        parcel: Rounds that a worker fetches at once; has no influence on the data.
         kept: Parcels of an earlier, interrupted call, and where to put the new ones.
         title: Of a progress bar on standard error; None shows none.
 
@@ -66,10 +66,11 @@ def record(
     """
     if workers is not None and workers < 1:
         raise UserError(f"workers: found {workers}, expected at least 1, or none for every core")
-    parcels = range(0, recorder.rounds, PARCEL)
+    parcels = range(0, recorder.rounds, parcel)
     missing = [first for first in parcels if kept is None or not kept.has(first)]
     workers = min(workers or _cores(), max(len(missing), 1))
-    made = _in_parallel(recorder, missing, workers) if workers > 1 else (_parcel(recorder, i) for i in missing)
+    parts = [range(first, min(first + parcel, recorder.rounds)) for first in missing]
+    made = _in_parallel(recorder, parts, workers) if workers > 1 else (_parcel(recorder, part) for part in parts)
     episodes = _in_order(parcels, set(missing), made, kept)
     return _with_progress(episodes, recorder.steps, title) if title else episodes
 
@@ -151,7 +152,7 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _in_parallel(recorder: EpisodeRecorder, parcels: list[int], workers: int) -> Iterator[list[Episode]]:
+def _in_parallel(recorder: EpisodeRecorder, parcels: list[range], workers: int) -> Iterator[list[Episode]]:
     # No fork: a parent that runs deep-learning threads must not be copied.
     method = "spawn" if sys.platform in ("win32", "darwin") else "forkserver"
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context(method), _keep, (recorder,))
@@ -175,13 +176,12 @@ def _keep(recorder: EpisodeRecorder) -> None:
     _recorder = recorder
 
 
-def _record(first: int) -> list[Episode]:
+def _record(rounds: range) -> list[Episode]:
     assert _recorder is not None
-    return _parcel(_recorder, first)
+    return _parcel(_recorder, rounds)
 
 
-def _parcel(recorder: EpisodeRecorder, first: int) -> list[Episode]:
-    rounds = range(first, min(first + PARCEL, recorder.rounds))
+def _parcel(recorder: EpisodeRecorder, rounds: range) -> list[Episode]:
     return [episode for number in rounds for episode in recorder(number)]
 
 

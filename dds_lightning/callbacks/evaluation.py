@@ -22,12 +22,13 @@ from dds_lightning.tasks import Task, get_task
 class RolloutEvaluation(Callback):
     """Play episodes now and then, and log how they went.
 
-    Logged for the first way of choosing skills: `rollout/success` (per cent of the episodes), `rollout/score`
-    (normalised, 0 to 100) and `rollout/length` (steps); for each further way the same under
-    `rollout/<selection>/`. While skills are trained the way is `random` skills, and
-    `rollout/best_skill_success` and `rollout/best_skill_score` tell of the best single skill alone.
+    Logged for the first way of choosing skills: `rollout/score` (normalised, 0 to 100), `rollout/length` (steps)
+    and, where the task measures it, `rollout/success` (per cent of the episodes); for each further way the
+    same under `rollout/<selection>/`. While skills are trained the way is `random` skills, and
+    `rollout/best_skill_score` and `rollout/best_skill_success` tell of the best single skill alone.
 
-    The values are there before a `ModelCheckpoint` looks, so `monitor: rollout/success` keeps the best.
+    The values are there before a `ModelCheckpoint` looks, so `monitor: rollout/score` keeps the best of any task
+    (what was chosen by playing in the test environment is an optimistic figure: report the last as well).
     Evaluation happens in one of two places:
 
     | setting               | when                               | the checkpoint that keeps the best       |
@@ -143,8 +144,8 @@ class RolloutEvaluation(Callback):
     def contestants(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> list[Contestant]:
         """Who plays; override it to evaluate a module of your own.
 
-        The first contestant's values are logged as `rollout/success` and so on, those of further ones under
-        their name.
+        The first contestant's values are logged as `rollout/score` and so on, those of further ones under their
+        name.
         """
         if isinstance(pl_module, SkillModule):
             agent = DDSAgent(pl_module, None, "random", noise_scale=self.noise_scale)
@@ -192,16 +193,17 @@ class RolloutEvaluation(Callback):
             self._pool = EnvPool(self.task, slots_needed(players, self.slots), self.workers)
         result = rollout(self.task, players, seed=self.seed, slots=self.slots, progress=False, pool=self._pool)
         self.last = result
+        measured = [*(["success"] if self.task.measures_success else []), "score"]
         values: dict[str, float] = {}
         for rank, row in enumerate(result.summary().to_dict("records")):
             name = str(row["actor"])
             if name == "best_skill":
-                single = result.episodes[result.episodes["actor"] == name].groupby("label")
-                values["rollout/best_skill_success"] = 100.0 * float(single["success"].mean().max())
-                values["rollout/best_skill_score"] = float(single["score"].mean().max())
+                own = RolloutResult(result.task, result.episodes[result.episodes["actor"] == name])
+                alone = own.summary("label")
+                values |= {f"rollout/best_skill_{key}": float(alone[key].max()) for key in measured}
                 continue
             prefix = "rollout" if rank == 0 else f"rollout/{name}"
-            values |= {f"{prefix}/{key}": float(row[key]) for key in ("success", "score", "length")}
+            values |= {f"{prefix}/{key}": float(row[key]) for key in (*measured, "length")}
         return values
 
     # ---------------------------------------------------------------- state and end

@@ -9,7 +9,7 @@ and logs go to standard error.
 import shlex
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout
 from typing import Any
 
@@ -60,14 +60,26 @@ def _dispatch(words: list[str]) -> int:
         else:
             as_json, work = _command(words)
     except ArgumentError as error:
-        known = STAGES.keys() | {"run", "relabel", "evaluate", "report", "data", "tasks"}
-        asked = shlex.join(["dds", *(words[:1] if words[:1] and words[0] in known else [])])
-        return _complain(f"{error.message} (see `{asked} --help`)")
+        return _complain(f"{error.message} (see `{shlex.join(['dds', *_path(words)])} --help`)")
     except SystemExit as stop:  # --help and --print_config end so
         if isinstance(stop, Interrupted):
             raise
         return int(stop.code or 0)
     return _report(work, as_json)
+
+
+def _path(words: list[str]) -> list[str]:
+    """The words that name a command: as many of the first as there are."""
+    from dds_lightning.cli.parser import COMMANDS
+
+    path: list[str] = []
+    table: Any = COMMANDS
+    for word in words:
+        if not isinstance(table, Mapping) or word not in table:
+            break
+        path.append(word)
+        table = table[word]
+    return path
 
 
 def _command(words: list[str]) -> tuple[bool, Callable[[], Any]]:

@@ -4,10 +4,14 @@ Heavy imports stay inside the functions, so that `dds tasks` need not wait for t
 """
 
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
+from dds_lightning.cli.arguments import data_spec
 from dds_lightning.errors import UserError
-from dds_lightning.reports import Report, table
+from dds_lightning.reports import Report, pairs, table
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
 
 
 def run(
@@ -18,6 +22,7 @@ def run(
     preset: str | None = None,
     data_steps: int = 200_000,
     clone_steps: int = 4000,
+    evaluate_every: int | None = None,
     episodes: int | None = None,
     episodes_per_skill: int = 20,
     selection: Literal["sample", "greedy", "argmax_q"] = "sample",
@@ -35,15 +40,26 @@ def run(
     given as --skill.KEY=VALUE and --policy.KEY=VALUE, for example --skill.trainer.max_steps=500
     --policy.model.alpha=5.
 
+    A task of several physics (`dds tasks NAME`) is played in the one in which the data were recorded.
+
+    With --json: `task` (with the variant of the data), `out`, `seed`, `seconds` and `outputs` of each stage,
+    `done_before`; after the report also `main` (the contestant that the run is about), `protocol` (as `dds evaluate
+    --json` has it), `table` (a row each: contestant, kind, episodes, success with success_low and success_high in per
+    cent, score, score_error, return, steps, length: median of the successful), `failures` (where the main
+    contestant's ended) and `diagnosis` (scores from the data to the policy, measures of the trainings). What is not
+    measured is null.
+
     Args:
         task: name of a task; `dds tasks` lists them
         out: folder of the run; without it runs/TASK
-        data: your data, local:DIR or minari:ID; without it data are collected in the environment
+        data: your data, local:DIR, minari:ID, d4rl:FILE or arrays:DIR; without it data are collected in the environment
         seed: of everything random: data, both trainings and the evaluation
-        preset: packaged pair of configurations (pointmaze, paper), or a folder with skill.yaml and
-            policy.yaml; without it the task family's
+        preset: packaged pair of configurations (antmaze, kitchen, locomotion, pointmaze, paper), or a folder with
+            skill.yaml and policy.yaml; without it the task family's
         data_steps: environment steps to collect
         clone_steps: optimiser steps of the behaviour-cloning baseline
+        evaluate_every: steps between two evaluations of 10 episodes while the policy trains; the best checkpoint by
+            their score is told beside the last; 0 for none; without it a quarter of the training, on PointMaze none
         episodes: evaluation episodes of each contestant; without it the task's own number
         episodes_per_skill: evaluation episodes of each single skill alone
         selection: how the published agent chooses skills; the table shows every way
@@ -60,11 +76,12 @@ def run(
         RunSettings(
             task=task,
             out=Path(out or f"runs/{task}"),
-            data=_spec(data) if data else None,
+            data=data_spec(data) if data else None,
             seed=seed,
             preset=preset,
             data_steps=data_steps,
             clone_steps=clone_steps,
+            evaluate_every=evaluate_every,
             episodes=episodes,
             episodes_per_skill=episodes_per_skill,
             selection=selection,
@@ -93,7 +110,7 @@ def relabel(
 
     Args:
         skill: skill checkpoint, a .ckpt file or a published directory
-        data: the data, local:DIR or minari:ID
+        data: local:DIR, minari:ID, d4rl:FILE, arrays:DIR, or just a folder or file
         task: name of the task; it decides how rewards are read
         out: file to write; without it the cache beside the checkpoint, where `dds policy fit` looks
         gamma: discount a step inside a skill
@@ -108,7 +125,7 @@ def relabel(
 
     module = RelabeledDataModule(
         task,
-        _spec(data),
+        data_spec(data),
         skill,
         gamma=gamma,
         discount=discount,
@@ -133,11 +150,22 @@ def evaluate(
     episodes: int | None = None,
     selection: list[str] = ["greedy", "sample"],  # noqa: B006
     temperature: float = 1.0,
+    checkpoint: Literal["last", "best", "both"] = "both",
     seed: int = 0,
     workers: int | None = None,
     out: str | None = None,
 ) -> Report:
     """Roll out a trained agent in its environment and print its scores.
+
+    The best checkpoint of a run was chosen by playing in the environment while it trained, so its figures are
+    optimistic; published scores are to be held against the last.
+
+    With --json: `agent` and `best` (directories of the last and the best checkpoint, null if they do not play),
+    `task`, `seed`, `protocol` (task with variant, environment, episodes, seed, checkpoint, noise_scale and sampler
+    of the decoder, temperature, horizon of a skill, max_episode_steps, score_min and score_max: the returns that
+    score 0 and 100, paper_score, best: how that checkpoint was chosen), `results` (a row each: actor, checkpoint,
+    episodes, success in per cent, score, score_error, return, length, length_success) and, with --out, `episodes`.
+    What is not measured is null.
 
     Args:
         directory: a run of `dds run`, or a published checkpoint
@@ -145,46 +173,24 @@ def evaluate(
         episodes: episodes for each way of choosing skills; without it the task's own number
         selection: how skills are chosen: greedy, sample, argmax_q, random; several give one row each
         temperature: of `sample`; below 1 is nearer to greedy
+        checkpoint: which of a run's checkpoints; both means the last and, where the run kept one, the best
         seed: of the environments and of sampling
         workers: processes for environments; without it one for every core
         out: Parquet file for the table of episodes
     """
-    from dds_lightning.agent import DDSAgent
-    from dds_lightning.checkpointing import load_published
-    from dds_lightning.rollout import rollout
-    from dds_lightning.study.contestants import agent_directory, way
-    from dds_lightning.tasks import get_task
+    from dds_lightning.study.evaluation import evaluate as play
 
-    path = agent_directory(Path(directory))
-    name = task or load_published(path).config.get("task")
-    if name is None:
-        raise UserError(f"{path} does not say which task it is for: give --task")
-    wanted = get_task(name)
-    count = wanted.evaluation_episodes if episodes is None else episodes
-    if count < 1:
-        raise UserError(f"--episodes is {count}, expected at least 1")
-    agent = DDSAgent.load(path, seed=seed)
-    found, expected = (agent.observation_dim, agent.action_dim), (wanted.observation_dim, wanted.action_dim)
-    if found != expected:
-        raise UserError(
-            f"the agent in {path} has (observation_dim, action_dim) {found}, task {name} has {expected}:  "
-            "it was trained for another task"
-        )
-    ways = [
-        way(agent, choice, count, temperature if choice == "sample" else 1.0) for choice in dict.fromkeys(selection)
-    ]
-    result = rollout(wanted, ways, seed=seed, workers=workers)
-    summary = result.summary()
-    report = Report(
-        {"agent": path, "task": name, "seed": seed, "results": summary},
-        [table(summary, f"{name}: {count} episodes each, seed {seed}")],
+    return play(
+        Path(directory),
+        task=task,
+        episodes=episodes,
+        selection=selection,
+        temperature=temperature,
+        checkpoint=checkpoint,
+        seed=seed,
+        workers=workers,
+        out=out,
     )
-    if out is not None:
-        Path(out).parent.mkdir(parents=True, exist_ok=True)
-        result.episodes.to_parquet(out, index=False)
-        report.data["episodes"] = out
-        report.text.append(out)
-    return report
 
 
 def report(directory: str) -> Report:
@@ -198,102 +204,72 @@ def report(directory: str) -> Report:
     return draw(directory)
 
 
-def data_collect(
-    task: str,
-    steps: int = 200_000,
-    seed: int = 0,
-    out: str = "data",
-    workers: int | None = None,
-    overwrite: bool = False,
-) -> Report:
-    """Make a data set by driving the task's environment, on all cores.
-
-    Args:
-        task: name of a task; `dds tasks` lists them
-        steps: environment steps
-        seed: the same seed gives the same bytes of every array, whatever the number of workers
-        out: folder of data sets; the new one is a folder in it
-        workers: processes; without it one for every core
-        overwrite: replace a data set of the same name
-    """
-    from datamodules.collect.pointmaze import collect_pointmaze
-
-    path = collect_pointmaze(task, steps, seed, out, workers, overwrite=overwrite)
-    return Report(
-        {"task": task, "data": f"local:{path}", "path": path, "steps": steps, "seed": seed},
-        [f"{steps:,} steps of {task} in {path}; use them as local:{path}"],
-    )
-
-
-def data_check(data: str, task: str | None = None, horizon: int | None = None) -> Report:
+def data_check(data: str, task: str | None = None, horizon: int | None = None, replay: int = 0) -> Report:
     """Read a data set from end to end and say what is wrong with it, if anything.
 
+    With --replay the simulator is put into recorded states and takes the recorded actions: where it leads elsewhere
+    than the recording, or pays other rewards, the data were made in another environment, and the exit status is 1.
+
+    With --json: `data`, `task`, `sound`, `facts`, `replay` (null without it): `steps`, `verdict` (fit or misfit),
+    `physics` (one for every variant of the task, with its error, limit, verdict, rewards and table of dimensions) and
+    `notes`.
+
     Args:
-        data: local:DIR, minari:ID or a folder
+        data: local:DIR, minari:ID, d4rl:FILE, arrays:DIR, or just a folder or file
         task: name of the task that the data should fit
         horizon: also count segments of this many steps, and refuse data without one
+        replay: steps to replay in the task's environment, 200 say; 0 for none
     """
     from datamodules.inspection import check_dataset
 
-    facts = check_dataset(_spec(data), task, horizon=horizon)
+    spec = data_spec(data)
+    if replay < 0:
+        raise UserError(f"--replay is {replay}, expected a number of steps, or 0 for none")
+    if not replay:
+        facts = check_dataset(spec, task, horizon=horizon)
+        return Report(
+            {"data": spec, "task": task, "sound": True, "facts": facts, "replay": None},
+            [_facts(facts), f"{spec} is sound" + (f" and fits {task}" if task else "")],
+        )
+    if task is None:
+        raise UserError("--replay needs an environment: give --task NAME; `dds tasks` lists them")
+    from datamodules.replay import replay_check
+
+    found = replay_check(spec, task, replay)
+    # What does not fit the task may well be sound; loading it for the task would refuse other coordinates first.
+    facts = check_dataset(spec, found.task if found.fit else None, horizon=horizon)
     return Report(
-        {"data": _spec(data), "task": task, "sound": True, "facts": facts},
-        [_facts(facts), f"{_spec(data)} is sound" + (f" and fits {task}" if task else "")],
+        {"data": spec, "task": found.task.name, "sound": True, "facts": facts, "replay": found.facts()},
+        [_facts(facts), table(found.table().head(12), f"{found.steps} steps in {found.task.name}"), *found.lines()],
+        status=0 if found.fit else 1,
     )
 
 
-def data_show(data: str, task: str | None = None, episodes: int = 10) -> Report:
-    """Show what is in a data set: the range of every dimension, and its longest episodes.
+def tasks(name: str | None = None) -> Report:
+    """List the tasks, or tell everything about one: environment, episodes, maze, rewards, scores, data.
 
     Args:
-        data: local:DIR, minari:ID or a folder
-        task: name of the task; with it mazes get the reward of the task's goal
-        episodes: rows of the table of episodes
+        name: of one task or of one of its variants, for example antmaze-umaze@robotics
     """
-    from datamodules import load_trajectories
-    from datamodules.inspection import describe, episode_table
-    from dds_lightning.tasks import get_task
+    from dds_lightning.tasks import get_task, task_names, task_table
+    from dds_lightning.tasks.facts import draw_maze, task_facts, task_lines
 
-    chosen = get_task(task) if task else None
-    trajectories = load_trajectories(_spec(data), chosen)
-    facts, dimensions = describe(trajectories, task=chosen)
-    rows = episode_table(trajectories).sort_values("steps", ascending=False, kind="stable").head(episodes)
+    if name is not None:
+        task = get_task(name)
+        return Report(task_facts(task), [pairs(task_lines(task), task.name), "\n".join(draw_maze(task))])
+    shown: list[RenderableType] = []
+    for (family, variants), rows in task_table().groupby(["family", "variants"], sort=False):
+        title = f"{family}, each also as NAME{variants}" if variants else family
+        shown.append(table(rows.drop(columns=["family", "variants"]), title, digits=4))
     return Report(
-        {"data": _spec(data), "task": task, "facts": facts, "dimensions": dimensions, "episodes": rows},
-        [_facts(facts), table(dimensions), table(rows, f"the {len(rows)} longest episodes")],
+        [task_facts(get_task(known)) for known in task_names()],
+        [
+            *shown,
+            "O/A: widths of observations and actions. score range: the returns that count as 0 and as 100.",
+            "paper: its scores, with D4RL's data in D4RL's physics; not to be compared with those of other data.",
+            "`dds tasks NAME` tells everything about one task, its maze and its data included.",
+        ],
     )
-
-
-def data_list(root: list[str] = ["data"]) -> Report:  # noqa: B006
-    """List the data sets in Minari's folder and in folders of your own.
-
-    Args:
-        root: folders to look in beside MINARI_DATASETS_PATH (or ~/.minari/datasets)
-    """
-    from datamodules.inspection import find_datasets
-
-    found = find_datasets(root)
-    if found.empty:
-        where = ", ".join(["Minari's folder", *root])
-        return Report(found, [f"no data sets in {where}; make one with `dds data collect TASK`"])
-    return Report(found, [table(found)])
-
-
-def tasks() -> Report:
-    """List the tasks: environment, start, goal, episode cap, reference scores and data sets."""
-    from dds_lightning.tasks import task_table
-
-    found = task_table()
-    return Report(found, [table(found)])
-
-
-def _spec(data: str) -> str:
-    """Accept a plain folder for `local:FOLDER`."""
-    if ":" not in data and Path(data).is_dir():
-        return f"local:{data}"
-    if ":" not in data:
-        raise UserError(f"data: there is no folder {data!r}; give local:DIR or minari:ID")
-    return data
 
 
 def _facts(facts: dict[str, object]) -> str:

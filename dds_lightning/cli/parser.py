@@ -1,12 +1,13 @@
 """From functions to a command line."""
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+import docstring_parser
 from jsonargparse import ArgumentParser
 
-from dds_lightning.cli import STAGES, commands
+from dds_lightning.cli import STAGES, checkpoints, commands, data
 from dds_lightning.errors import UserError
 
 Commands = Mapping[str, Any]  # name -> function, a group of commands, or None for one of Lightning's
@@ -19,14 +20,23 @@ COMMANDS: Commands = {
     "evaluate": commands.evaluate,
     "report": commands.report,
     "data": {
-        "collect": commands.data_collect,
+        "list": data.list_,
+        "show": data.show,
         "check": commands.data_check,
-        "list": commands.data_list,
-        "show": commands.data_show,
+        "fetch": data.fetch,
+        "collect": data.collect,
     },
     "tasks": commands.tasks,
+    "publish": checkpoints.publish,
+    "checkpoints": {"list": checkpoints.list_, "verify": checkpoints.verify},
+    "export": checkpoints.export,
 }
-GROUPS = {"data": "Collect, check, list and show data sets."}
+GROUPS = {
+    "data": "List, show, check, fetch and collect data sets.",
+    "checkpoints": "List and verify published agents.",
+}
+OPTIONAL_WORDS = {commands.tasks: "name"}
+"""Functions with a parameter that has a default and is typed without its name all the same."""
 
 
 def build_parser() -> tuple[ArgumentParser, dict[str, Callable[..., Any]]]:
@@ -57,9 +67,27 @@ def _add(parser: ArgumentParser, table: Commands, functions: dict[str, Callable[
             about = documentation.split("\nArgs:", 1)[0].strip()
             leaf = ArgumentParser(description=about, exit_on_error=False)
             leaf.add_argument("--json", action="store_true", help="print one JSON document and nothing else")
-            leaf.add_function_arguments(entry, as_group=False, as_positional=True)
+            optional = OPTIONAL_WORDS.get(entry)
+            if optional:
+                leaf.add_argument(optional, nargs="?", help=_help(documentation, optional))
+            leaf.add_function_arguments(
+                entry, as_group=False, as_positional=True, skip={optional} if optional else None
+            )
             subcommands.add_subcommand(name, leaf, help=first)
             functions[prefix + name] = entry
+
+
+def _functions(table: Commands) -> Iterator[Callable[..., Any]]:
+    for entry in table.values():
+        if isinstance(entry, Mapping):
+            yield from _functions(entry)
+        elif entry is not None:
+            yield entry
+
+
+def _help(documentation: str, parameter: str) -> str:
+    described = {each.arg_name: each.description for each in docstring_parser.parse(documentation).params}
+    return described.get(parameter) or ""
 
 
 def prepare(words: list[str]) -> list[str]:
@@ -73,7 +101,7 @@ def prepare(words: list[str]) -> list[str]:
     """
     flags = {
         f"--{name}"
-        for function in (commands.run, commands.evaluate, commands.relabel, commands.data_collect)
+        for function in _functions(COMMANDS)
         for name, parameter in inspect.signature(function).parameters.items()
         if parameter.default is False
     }

@@ -2,13 +2,14 @@
 
 import textwrap
 
+import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
 from dds_lightning.interpret.drawing import LABEL, TICKS
 from dds_lightning.interpret.palette import NO_SKILL, SKILL_COLOURS
 
-WRAP = 34
+WRAP = 40
 """Letters of a contestant's name on one line."""
 
 
@@ -21,12 +22,13 @@ def plot_scores(summary: pd.DataFrame) -> Figure:
     rows = summary.iloc[::-1]  # bars are drawn from below
     names = [textwrap.fill(str(name), WRAP) for name in rows["contestant"]]
     colours = [NO_SKILL if kind == "skill" else SKILL_COLOURS[0] for kind in rows["kind"]]
-    lines = sum(name.count("\n") + 1 for name in names)
-    figure = Figure(figsize=(7.0, 0.8 + 0.24 * lines), layout="constrained")
+    lines = np.array([name.count("\n") + 1 for name in names])
+    places = np.cumsum(lines) - lines / 2  # a long name takes its room
+    figure = Figure(figsize=(7.0, 0.7 + 0.19 * lines.sum()), layout="constrained")
     ax = figure.add_subplot()
     errors = rows["score_error"].fillna(0.0)
-    ax.barh(range(len(rows)), rows["score"], xerr=errors, color=colours, height=0.7, ecolor="black", capsize=2)
-    for place, score, error in zip(range(len(rows)), rows["score"], errors, strict=True):
+    ax.barh(places, rows["score"], xerr=errors, color=colours, height=0.7, ecolor="black", capsize=2)
+    for place, score, error in zip(places, rows["score"], errors, strict=True):
         ax.annotate(
             f"{score:.1f}",
             (max(score + error, 0.0), place),
@@ -35,9 +37,10 @@ def plot_scores(summary: pd.DataFrame) -> Figure:
             va="center",
             fontsize=8,
         )
-    ax.set_yticks(range(len(rows)), names, fontsize=8)
+    ax.set_yticks(places, names, fontsize=8)
     ax.axvline(0.0, color="black", linewidth=0.8)
-    ax.margins(x=0.1, y=0.01)
+    ax.set_ylim(0.0, lines.sum())
+    ax.margins(x=0.1)
     ax.tick_params(axis="x", labelsize=TICKS)
     ax.set_xlabel("normalised score, ± standard error", fontsize=LABEL)
     ax.spines[["top", "right"]].set_visible(False)

@@ -1,10 +1,13 @@
 """The card of a published agent: what it does, how well, and how it was made, for whoever finds the directory."""
 
+import textwrap
 from collections.abc import Mapping
 from typing import Any
 
 import pandas as pd
 
+from dds_lightning.study.page import headline
+from dds_lightning.study.protocol import paper_line
 from dds_lightning.study.tables import CONTESTANT, markdown, readable, summary_table
 from dds_lightning.tasks import Task
 
@@ -24,7 +27,8 @@ def agent_card(
         task: where the agent acts.
         episodes: the rollout's table; its first contestant is how the agent acts by default.
         seed: of training and evaluation.
-        data: facts about the data, name to value.
+        data: facts about the data, name to value; "source" is where they come from, as `--data` takes it, or a
+            sentence that begins with "collected" where they were made for this agent.
         settings: "skill" and "policy" to the parsed settings of their training.
         command: what makes the same agent again.
     """
@@ -33,12 +37,9 @@ def agent_card(
     first = table.iloc[0]
     facts = "\n".join(f"- {name}: {value}" for name, value in data.items())
     trained = "\n".join(_training(stage, chosen) for stage, chosen in settings.items())
-    what = f"From cell {task.start_cell} to cell {task.goal_cell} of " if task.maze_map is not None else ""
     return f"""# {task.name}: an agent with discrete diffusion skills
 
-{what}{task.env_id}, at most {task.max_episode_steps} steps. **{first["contestant"]}: {first["success"]:.1f} % of
-{first["episodes"]} episodes** (95 % interval {first["success_low"]:.1f} to {first["success_high"]:.1f}), normalised
-score {first["score"]:.1f}. One training, seed {seed}; the score is of the last checkpoint.
+{_opening(first, task)} One training, seed {seed}; the score is of the last checkpoint.
 
 ```python
 from dds_lightning import DDSAgent, get_task
@@ -52,7 +53,7 @@ action = agent.act(observation)  # a skill every {settings["skill"]["data"]["hor
 
 ## Scores
 
-{markdown(readable(table))}
+{markdown(readable(table, task))}{_paper(task)}
 
 ## Data
 
@@ -66,9 +67,58 @@ action = agent.act(observation)  # a skill every {settings["skill"]["data"]["hor
 
 ## What it cannot do
 
-It knows one maze, one start and one goal: another goal needs a policy of its own (the skills can be used again). The
-data were made by a scripted controller of this project; scores are not comparable with those on D4RL's data sets.
+{textwrap.fill(f"{_limits(task)} {_provenance(str(data.get('source', '')), task)}", 120, break_on_hyphens=False)}
 """
+
+
+def _opening(first: pd.Series, task: Task) -> str:
+    where = f"{task.env_id}, at most {task.max_episode_steps} steps."
+    if task.maze_map is None:
+        return f"{where} {headline(first, task)}."
+    return (
+        f"From cell {task.start_cell} to cell {task.goal_cell} of {where} "
+        f"**{first['contestant']}: {first['success']:.1f} % of\n{first['episodes']} episodes** (95 % interval "
+        f"{first['success_low']:.1f} to {first['success_high']:.1f}), normalised\nscore {first['score']:.1f}."
+    )
+
+
+def _paper(task: Task) -> str:
+    line = paper_line(task)
+    return f"\n\n{line}" if line else ""
+
+
+def _limits(task: Task) -> str:
+    """What the agent was never taught."""
+    if task.maze_map is not None:
+        return (
+            "It knows one maze, one start and one goal: another goal needs a policy of its own (the skills can be used "
+            "again)."
+        )
+    if task.subtasks:
+        return (
+            f"It knows one kitchen and {len(task.subtasks)} subtasks ({', '.join(task.subtasks)}): others need a "
+            "policy of their own (the skills can be used again)."
+        )
+    return (
+        "It knows one body in one physics and moves as its data do: another body or another aim needs data and "
+        "training of its own."
+    )
+
+
+def _provenance(source: str, task: Task) -> str:
+    """Whose data they were, and what its scores may therefore be compared with."""
+    if source.startswith("collected"):
+        who = "a scripted controller" if task.family == "pointmaze" else "controllers"
+        return f"The data were made by {who} of this project; scores are not comparable with those on D4RL's data sets."
+    if source.startswith("d4rl:"):
+        return (
+            f"The data are a file in D4RL's layout ({source}): compare scores only with others on that same file, and "
+            f"mind the environment that they were played in, {task.env_id}."
+        )
+    return (
+        f"The data were given by whoever trained it ({source}): compare scores only with others on the same data, and "
+        "not with those on D4RL's data sets."
+    )
 
 
 def _training(stage: str, chosen: Mapping[str, Any]) -> str:

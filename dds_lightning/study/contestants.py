@@ -1,5 +1,6 @@
 """Who plays in the final table: one agent whose skills are chosen in several ways, and its baselines."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,10 +29,32 @@ def way_name(selection: str, temperature: float = 1.0) -> str:
     return names[selection]
 
 
-def way(agent: "DDSAgent", selection: str, episodes: int, temperature: float = 1.0) -> Contestant:
-    """One way of choosing skills as a contestant."""
-    name = way_name(selection, temperature)
+def way(
+    agent: "DDSAgent", selection: str, episodes: int, temperature: float = 1.0, best: Mapping[str, Any] | None = None
+) -> Contestant:
+    """One way of choosing skills as a contestant.
+
+    Args:
+        agent: whose skills and policy.
+        selection: as in `DDSAgent`.
+        episodes: how many it plays.
+        temperature: of `sample`.
+        best: facts of the checkpoint (see `protocol.best_facts`), if it is not the last one; its name says so.
+    """
+    name = way_name(selection, temperature) + (f" ({best_words(best)})" if best else "")
     return Contestant(name, agent.variant(selection, temperature=temperature), episodes)  # type: ignore[arg-type]
+
+
+def best_ways(agent: "DDSAgent", episodes: int, facts: Mapping[str, Any]) -> list[Contestant]:
+    """The best checkpoint's policy, sampled and greedy; `facts` as in `way`."""
+    return [way(agent, selection, episodes, best=facts) for selection in ("sample", "greedy")]
+
+
+def best_words(best: Mapping[str, Any]) -> str:
+    """How a checkpoint was chosen that is not the last one, and what that does to its score."""
+    if not str(best["monitor"]).startswith("rollout/"):
+        return f"best {best['monitor']} while training, step {best['step']:,}"
+    return f"best of {best['evaluations']} evaluations while training, step {best['step']:,}: optimistic"
 
 
 def final_table(
@@ -41,6 +64,7 @@ def final_table(
     episodes_per_skill: int,
     clone: Any = None,
     controller: Any = None,
+    best: Sequence[Contestant] = (),
 ) -> list[Contestant]:
     """Everyone in the table at the end of `dds run`.
 
@@ -51,6 +75,7 @@ def final_table(
         episodes_per_skill: for each single skill alone.
         clone: actor of the behaviour-cloning baseline, if there is one.
         controller: actor that made the data, if there is one.
+        best: ways of choosing of the best checkpoint, if one was kept.
     """
     ways = [
         (agent.selection, agent.temperature),
@@ -60,7 +85,7 @@ def final_table(
         ("argmax_q", 1.0),
     ]
     table = {way_name(*choice): way(agent, choice[0], episodes, choice[1]) for choice in [*ways, ("random", 1.0)]}
-    contestants = [*table.values(), single_skills(agent, episodes_per_skill)]
+    contestants = [*table.values(), *best, single_skills(agent, episodes_per_skill)]
     if clone is not None:
         contestants.append(Contestant("behaviour cloning", clone, episodes))
     if controller is not None:
@@ -106,6 +131,10 @@ class EveryRow:
         return self.actor.act(self._last, begun)[rows]
 
 
+BEST_AGENT = Path("evaluate", "best")
+"""Where a run publishes its best checkpoint, if it kept one; the last is in `agent`."""
+
+
 def agent_directory(directory: Path) -> Path:
     """The published agent of a run directory, or the directory itself if it is a published one.
 
@@ -122,3 +151,9 @@ def agent_directory(directory: Path) -> Path:
         f"{directory} is neither a finished run (no agent/model.safetensors) nor a published checkpoint: "
         f"it holds {there}"
     )
+
+
+def best_directory(directory: Path) -> Path | None:
+    """The published best checkpoint of a run directory, if it kept one."""
+    found = directory / BEST_AGENT
+    return found if (found / "model.safetensors").is_file() else None

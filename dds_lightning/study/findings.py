@@ -63,6 +63,7 @@ class Findings:
         parts = episodes.groupby("actor", sort=False)["label"].nunique()
         singles = next((str(name) for name in parts.index[parts > 1]), None)
         usage = root / "relabel" / "codes.csv"
+        effects = ("dx", "dy", "distance") if task.maze_map is not None else ("reward",)
         return cls(
             root,
             task,
@@ -75,9 +76,19 @@ class Findings:
                 episodes.loc[episodes["actor"] == main, "codes"],
                 pd.read_csv(usage) if usage.is_file() else None,
                 episodes[episodes["actor"] == singles] if singles else None,
+                effects,
             ),
             {stage: marker for stage in STAGES if (marker := _marker(root / stage / "stage.json"))},
         )
+
+    def facts(self, stage: str) -> Mapping[str, Any]:
+        """What a stage's marker tells beside its files; empty where there is none."""
+        return self.markers.get(stage, {}).get("facts", {})
+
+    @property
+    def protocol(self) -> Mapping[str, Any] | None:
+        """How the evaluation was done, see `protocol.protocol`; None where an older version did it."""
+        return self.facts("evaluate").get("protocol")
 
 
 def _marker(path: Path) -> dict[str, Any]:

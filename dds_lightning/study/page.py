@@ -4,28 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import pandas as pd
+
 from dds_lightning.study.findings import Findings
+from dds_lightning.study.protocol import heading, paper_line
 from dds_lightning.study.tables import BEST, CONTESTANT, SKILL, ends, markdown, readable
+from dds_lightning.tasks import Task
 
 _OTHERS = 3
 """Commonest ends that are listed for each contestant beside the main one."""
 
 
-def page(found: Findings, files: Mapping[str, str]) -> str:
+def page(found: Findings, files: Mapping[str, str], diagnosis: Mapping[str, pd.DataFrame]) -> str:
     """The report as Markdown.
 
     Args:
         found: what it tells.
         files: name -> file beside it, of those that were made.
+        diagnosis: the tables of `diagnosis.diagnose`.
     """
     parts = [f"# {found.task.name}", _opening(found), _results(found)]
+    if "scores" in files:
+        parts.append(_picture(files, "scores", "Normalised scores; grey: single skills."))
+    parts.append(_diagnosis(diagnosis))
     if "trajectories" in files:
         parts.append("## How the policy gets there\n")
         parts.append(_picture(files, "trajectories", f"{found.main}, coloured by the skill in use."))
     if "clip" in files:
         parts.append(_picture(files, "clip", "One episode: the successful one of median length, if any succeeded."))
     parts.append(_skills(found, files))
-    parts.append(_failures(found, files))
+    if "failures" in files:
+        parts.append(_failures(found, files))
     if "values" in files:
         parts.append("## What the critic believes\n")
         text = (
@@ -37,7 +46,8 @@ def page(found: Findings, files: Mapping[str, str]) -> str:
         parts.append("## Training\n")
         parts.append(_picture(files, "training", "Read from the metrics.csv of both trainings."))
     parts.append(_run(found))
-    tables = ", ".join(f"[{files[name]}]({files[name]})" for name in ("summary", "failures", "skills"))
+    names = [name for name in ("summary", "failures", "skills") if name in files]
+    tables = ", ".join(f"[{files[name]}]({files[name]})" for name in names)
     parts.append(f"Tables: {tables}; every episode is in [evaluate/episodes.parquet](../evaluate/episodes.parquet).")
     return "\n\n".join(part.strip() for part in parts if part) + "\n"
 
@@ -45,27 +55,49 @@ def page(found: Findings, files: Mapping[str, str]) -> str:
 def _opening(found: Findings) -> str:
     row = found.summary.iloc[0]
     task = found.task
-    what = "reached the goal" if task.maze_map is not None else "succeeded"
-    text = (
-        f"**{found.main}** {what} in **{row['success']:.1f} %** of {row['episodes']} episodes (95 % interval "
-        f"{row['success_low']:.1f} to {row['success_high']:.1f}), normalised score {row['score']:.1f}"
-    )
-    text += f", median {row['length']:.0f} steps" if row["length"] == row["length"] else ""
-    text += f", at most {task.max_episode_steps} steps an episode, in {task.env_id}"
+    text = f"{headline(row, task)}, at most {task.max_episode_steps} steps an episode, in {task.env_id}"
     if task.maze_map is not None:
         text += f" from cell {task.start_cell} to cell {task.goal_cell}"
-    text += "."
-    if task.paper_score is not None:
-        text += f" The paper reports {task.paper_score:.1f}."
-    return text
+    lines = [text + "."]
+    lines += [f"{heading(found.protocol)}."] if found.protocol else []
+    return "\n\n".join([*lines, *filter(None, [paper_line(task)])])
+
+
+def headline(row: pd.Series, task: Task) -> str:
+    """What a contestant reached, in half a sentence: the number that the task is judged by comes first.
+
+    Args:
+        row: of `tables.summary_table`.
+        task: what was played.
+    """
+    error = "" if pd.isna(row["score_error"]) else f" ± {row['score_error']:.1f}"
+    if not task.measures_success:
+        return (
+            f"**{row['contestant']}**: normalised score **{row['score']:.1f}{error}** over {row['episodes']} episodes, "
+            f"mean return {row['return']:.1f}, mean length {row['steps']:.0f} steps"
+        )
+    interval = f"(95 % interval {row['success_low']:.1f} to {row['success_high']:.1f})"
+    if task.subtasks:
+        count = len(task.subtasks)
+        return (
+            f"**{row['contestant']}**: normalised score **{row['score']:.1f}{error}** over {row['episodes']} episodes, "
+            f"{row['return']:.2f} of {count} subtasks on average, all {count} in {row['success']:.1f} % {interval}"
+        )
+    what = "reached the goal" if task.maze_map is not None else "succeeded"
+    text = (
+        f"**{row['contestant']}** {what} in **{row['success']:.1f} %** of {row['episodes']} episodes "
+        f"{interval}, normalised score {row['score']:.1f}"
+    )
+    return text + (f", median {row['length']:.0f} steps" if row["length"] == row["length"] else "")
 
 
 def _results(found: Findings) -> str:
-    notes = "Intervals are Wilson's, ± is the standard error. All contestants played from the same starts."
+    notes = "Intervals are Wilson's, ± is" if found.task.measures_success else "± is"
+    notes += " the standard error. All contestants played from the same starts."
     if (found.summary["kind"] == BEST).any():
         each = int(found.summary.loc[found.summary["kind"] == SKILL, "episodes"].iloc[0])
         notes += f" The best single skill was picked afterwards, from {each} episodes each, which flatters it."
-    table = readable(found.summary)
+    table = readable(found.summary, found.task)
     table["contestant"] = [
         name.strip() if kind == CONTESTANT else f"&nbsp;&nbsp;{name.strip()}"
         for name, kind in zip(table["contestant"], found.summary["kind"], strict=True)
@@ -76,6 +108,9 @@ def _results(found: Findings) -> str:
 def _skills(found: Findings, files: Mapping[str, str]) -> str:
     formats = {"in data": ".1f", "chosen": ".1f", "alone": ".0f", "dx": ".2f", "dy": ".2f", "distance": ".2f"}
     headings = {"in data": "in data %", "chosen": "chosen %", "alone": "success alone %"}
+    if found.task.maze_map is None:
+        formats |= {"alone": ".1f", "reward": ".3f"}
+        headings["alone"] = "score alone"
     table = found.skills
     shown = markdown(table.rename(columns=headings), {headings.get(k, k): v for k, v in formats.items()})
     text = "## The skills\n\n"
@@ -88,7 +123,17 @@ def _skills(found: Findings, files: Mapping[str, str]) -> str:
     text += shown + f"\n\nChosen: share of the decisions of {found.main}."
     if "dx" in table:
         text += " dx, dy and distance: mean change of the first two observations over a segment of the data."
+    if "reward" in table:
+        text += " reward: mean of a segment of the data, discounted, in the learner's convention."
     return text
+
+
+def _diagnosis(tables: Mapping[str, pd.DataFrame]) -> str:
+    text = (
+        "## Where it loses\n\nFrom what the data hold, by what a copy of their actions and one skill alone reach, to "
+        "what choosing skills reaches.\n\n" + markdown(tables["scores"], {"score": ".1f"})
+    )
+    return text if tables["measures"].empty else f"{text}\n\n{markdown(tables['measures'])}"
 
 
 def _failures(found: Findings, files: Mapping[str, str]) -> str:

@@ -18,8 +18,11 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from dds_lightning.files import written_whole
+from dds_lightning.study.diagnosis import diagnose
 from dds_lightning.study.findings import Findings
+from dds_lightning.study.protocol import heading, paper_line
 from dds_lightning.study.tables import ends, readable
+from dds_lightning.tasks import get_task
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -39,8 +42,10 @@ def write_report(run_dir: str | Path) -> dict[str, Any]:
         run_dir: a directory of `dds run`, evaluated.
 
     Returns:
-        Paths of the files by name, and the facts that `told` prints: `task`, `main`, `table`, `failures` (of
-        the main contestant), as plain JSON values.
+        Paths of the files by name, and the facts that `told` prints, as plain JSON values: `task`, `main` (the
+        contestant that the run is about), `protocol` (see `protocol.protocol`; None of an older run), `table`
+        (see `tables.summary_table`), `failures` (of the main contestant; see `tables.failures_table`) and
+        `diagnosis` (see `diagnosis.diagnose`).
 
     Raises:
         UserError: nothing has been evaluated there, or a file is damaged.
@@ -51,22 +56,28 @@ def write_report(run_dir: str | Path) -> dict[str, Any]:
     found = Findings.read(Path(run_dir))
     folder = found.root / "report"
     made: dict[str, Path] = {}
-    for name in ("summary", "failures", "skills"):
+    tables = ("summary", "failures", "skills") if found.task.measures_success else ("summary", "skills")
+    for name in tables:
         made[name] = folder / f"{name}.csv"
         with written_whole(made[name]) as part:
             getattr(found, name).to_csv(part, index=False, lineterminator="\n")
-    made |= _draw(found, folder)
+    logs = {stage: path for stage in ("skill", "policy") if (path := _metrics(found.root, stage, folder))}
+    made |= _draw(found, folder, logs)
+    diagnosis = diagnose(found, logs)
     text = folder / "report.md"
     with written_whole(text) as part:
-        part.write_text(page(found, {name: path.name for name, path in made.items()}), encoding="utf-8")
+        part.write_text(page(found, {name: path.name for name, path in made.items()}, diagnosis), encoding="utf-8")
     failures = found.failures[found.failures["contestant"] == found.main].drop(columns="contestant")
     facts = {
         "task": found.task.name,
         "main": found.main,
+        "protocol": found.protocol,
         "table": found.summary.round(4),
         "failures": failures.round(4).astype(object).where(failures.notna(), None),
+        "diagnosis": {name: table.round(4) for name, table in diagnosis.items()},
     }
-    made["failures_table"] = made.pop("failures")  # the name belongs to the facts
+    if "failures" in made:
+        made["failures_table"] = made.pop("failures")  # the name belongs to the facts
     return {"report": text, **made, **plain(facts)}
 
 
@@ -87,8 +98,14 @@ def told(facts: Mapping[str, Any]) -> list[RenderableType]:
     """The facts of `write_report` for a terminal: the table, and where the main contestant's failures ended."""
     from dds_lightning.reports import table
 
-    text: list[RenderableType] = [table(readable(pd.DataFrame(facts["table"])), facts["task"])]
+    task, protocol = get_task(facts["task"]), facts.get("protocol")
+    summary = readable(pd.DataFrame(facts["table"]), task)
+    text: list[RenderableType] = [heading(protocol) if protocol else facts["task"], table(summary)]
+    if line := paper_line(task):
+        text.append(line)
     failures = pd.DataFrame(facts["failures"])
+    if not task.measures_success:
+        return text
     if failures.empty:
         return [*text, f"{facts['main']}: no episode failed"]
     title = f"{facts['main']}: where {failures['episodes'].sum()} failed episodes ended"
@@ -98,9 +115,9 @@ def told(facts: Mapping[str, Any]) -> list[RenderableType]:
 # ---------------------------------------------------------------------- drawing
 
 
-def _draw(found: Findings, folder: Path) -> dict[str, Path]:
+def _draw(found: Findings, folder: Path, logs: Mapping[str, Path]) -> dict[str, Path]:
     """Every figure that the run's files and its task allow."""
-    from dds_lightning.interpret import curves
+    from dds_lightning.interpret import bars, curves
 
     made: dict[str, Path] = {}
 
@@ -112,9 +129,10 @@ def _draw(found: Findings, folder: Path) -> dict[str, Path]:
 
     if found.task.maze_map is not None:
         _draw_maze(found, folder, keep, made)
-    logs = {stage: path for stage in ("skill", "policy") if (path := _metrics(found.root, stage, folder))}
+    else:
+        keep("scores", bars.plot_scores(found.summary))
     if logs:
-        keep("training", curves.plot_training_curves(logs))
+        keep("training", curves.plot_training_curves(dict(logs)))
     return made
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from statistics import NormalDist
 from typing import Any
 
@@ -47,8 +47,9 @@ def summary_table(episodes: pd.DataFrame) -> pd.DataFrame:
 
     Returns:
         Columns `contestant` (its name says how codes are chosen), `kind` ("contestant", "best" or "skill"),
-        `episodes`, `success` with `success_low` and `success_high` (per cent; Wilson, 95 %), `score` (mean,
-        normalised) with `score_error` (its standard error), `length` (median steps of successful episodes).
+        `episodes`, `success` with `success_low` and `success_high` (per cent; Wilson, 95 %; NaN where the task
+        does not measure success), `score` (mean, normalised) with `score_error` (its standard error), `return`
+        (mean), `steps` (mean of all episodes), `length` (median steps of successful episodes).
     """
     rows = []
     for actor, played in episodes.groupby("actor", sort=False):
@@ -67,29 +68,40 @@ def summary_table(episodes: pd.DataFrame) -> pd.DataFrame:
 
 
 def _row(name: str, kind: str, played: pd.DataFrame) -> dict[str, Any]:
-    count, successes = len(played), int(played["success"].sum())
-    low, high = wilson(successes, count)
+    count, succeeded = len(played), _succeeded(played)
+    success = low = high = math.nan
+    if succeeded is not None:
+        success = 100.0 * int(succeeded.sum()) / count
+        low, high = wilson(int(succeeded.sum()), count)
     score = played["score"].to_numpy(dtype=float)
     return {
         "contestant": name,
         "kind": kind,
         "episodes": count,
-        "success": 100.0 * successes / count,
+        "success": success,
         "success_low": 100.0 * low,
         "success_high": 100.0 * high,
         "score": float(score.mean()),
         "score_error": float(score.std(ddof=1) / math.sqrt(count)) if count > 1 else math.nan,
-        "length": float(played.loc[played["success"].astype(bool), "length"].median()),
+        "return": float(played["return"].mean()),
+        "steps": float(played["length"].mean()),
+        "length": math.nan if succeeded is None else float(played.loc[succeeded, "length"].median()),
     }
 
 
+def _succeeded(episodes: pd.DataFrame) -> pd.Series | None:
+    """Which episodes succeeded, as plain bools; None where the task does not measure success."""
+    return None if episodes["success"].isna().any() else episodes["success"].astype(bool)
+
+
 def _rank(row: Mapping[str, Any]) -> tuple[float, float, float]:
-    """Orders parts: success, then score, then the shorter way."""
-    return row["success"], row["score"], -row["length"] if row["length"] == row["length"] else -math.inf
+    """Orders parts: score, then success (in mazes the same), then the shorter way."""
+    success, length = row["success"], row["length"]
+    return row["score"], 0.0 if math.isnan(success) else success, -math.inf if math.isnan(length) else -length
 
 
 def failures_table(episodes: pd.DataFrame, task: Task) -> pd.DataFrame:
-    """Where failed episodes ended and with which skill, the commonest end first.
+    """Where failed episodes ended and with which skill, the commonest end first; none where nothing can fail.
 
     Args:
         episodes: as in `RolloutResult.episodes`.
@@ -99,7 +111,9 @@ def failures_table(episodes: pd.DataFrame, task: Task) -> pd.DataFrame:
         Columns `contestant`, `row` and `column` of the end cell (missing where there is no maze), `skill` in
         use (-1 without skills), `episodes`, `share` (of the contestant's failures).
     """
-    failed = episodes.loc[~episodes["success"].astype(bool), ["actor", "final_x", "final_y", "final_code"]]
+    succeeded = _succeeded(episodes)
+    ended = episodes[["actor", "final_x", "final_y", "final_code"]]
+    failed = ended.iloc[:0] if succeeded is None else ended[~succeeded]
     cells = np.full((len(failed), 2), -1, dtype=np.int64)
     known = failed[["final_x", "final_y"]].notna().all(axis=1).to_numpy()
     if task.maze_map is not None and known.any():
@@ -126,18 +140,22 @@ def failures_table(episodes: pd.DataFrame, task: Task) -> pd.DataFrame:
 
 
 def skills_table(
-    chosen: Iterable[Iterable[int]], data: pd.DataFrame | None, alone: pd.DataFrame | None
+    chosen: Iterable[Iterable[int]],
+    data: pd.DataFrame | None,
+    alone: pd.DataFrame | None,
+    effects: Sequence[str] = ("dx", "dy", "distance"),
 ) -> pd.DataFrame:
-    """One row a code: how often the data use it and the policy chooses it, where it leads, what it does alone.
+    """One row a code: how often the data use it and the policy chooses it, what it does, how it scores alone.
 
     Args:
         chosen: the codes of each of the policy's episodes.
         data: summary of the relabelled data (`relabel/codes.csv`), if there is one.
         alone: episodes of the single skills (rows of `RolloutResult.episodes`), if they played.
+        effects: columns of `data` that tell what a segment of the code does, in the data's units.
 
     Returns:
-        Columns `skill`, `in data`, `chosen` (per cent), `dx`, `dy`, `distance` (of a segment, in the
-        observation's units), `alone` (per cent success, or NaN); those without a source are left out.
+        Columns `skill`, `in data`, `chosen` (per cent), the effects, `alone` (mean normalised score, in a maze
+        the per cent that reach the goal; or NaN); those without a source are left out.
     """
     codes = np.fromiter((code for episode in chosen for code in episode), dtype=np.int64)
     count = int(codes.max(initial=-1)) + 1
@@ -150,32 +168,49 @@ def skills_table(
         table["in data"] = 100.0 * data.set_index("code")["share"].reindex(table["skill"]).to_numpy()
     table["chosen"] = 100.0 * np.bincount(codes, minlength=count) / max(len(codes), 1)
     if data is not None:
-        moves = data.set_index("code").reindex(table["skill"])
-        for name in ("dx", "dy", "distance"):
-            table[name] = moves[name].to_numpy()
+        found = data.set_index("code").reindex(table["skill"])
+        for name in effects:
+            table[name] = found[name].to_numpy()
     if alone is not None:
-        rates = alone.groupby("final_code")["success"].mean()
-        table["alone"] = 100.0 * rates.reindex(table["skill"]).to_numpy(dtype=float)
+        scores = alone.groupby("final_code")["score"].mean()
+        table["alone"] = scores.reindex(table["skill"]).to_numpy(dtype=float)
     return table
 
 
-def readable(summary: pd.DataFrame) -> pd.DataFrame:
-    """The summary as it is printed: units in the headings, a mean with its standard error, a rate with its interval."""
+def readable(summary: pd.DataFrame, task: Task) -> pd.DataFrame:
+    """The summary as it is printed: units in the headings, a mean with its standard error, a rate with its interval.
+
+    Mazes are told by their success; elsewhere the normalised score comes first, with the return behind it.
+    """
     skill = summary["kind"] == SKILL
-    columns = {
+    columns: dict[str, Any] = {
         "contestant": summary["contestant"].where(~skill, "  " + summary["contestant"]),
         "episodes": summary["episodes"],
+    }
+    score = {
+        "score": [
+            cell(mean, ".1f") + ("" if pd.isna(error) else f" ± {error:.1f}")
+            for mean, error in zip(summary["score"], summary["score_error"], strict=True)
+        ]
+    }
+    if not task.measures_success:
+        returns = [cell(value, ".1f") for value in summary["return"]]
+        steps = [cell(value, ".0f") for value in summary["steps"]]
+        return pd.DataFrame(columns | score | {"return": returns, "steps (mean)": steps})
+    success = {
         "success %": [cell(value, ".1f") for value in summary["success"]],
         "95 % interval": [
             f"{low:.1f} to {high:.1f}"
             for low, high in zip(summary["success_low"], summary["success_high"], strict=True)
         ],
-        "score": [
-            cell(mean, ".1f") + ("" if pd.isna(error) else f" ± {error:.1f}")
-            for mean, error in zip(summary["score"], summary["score_error"], strict=True)
-        ],
-        "steps (median, successes)": [cell(value, ".0f") for value in summary["length"]],
     }
+    if task.subtasks:
+        done = [cell(value, ".2f") for value in summary["return"]]
+        columns |= score | {f"subtasks done, of {len(task.subtasks)}": done}
+        columns |= {f"all {len(task.subtasks)}, %": success.pop("success %")} | success
+    else:
+        columns |= success | score
+    columns["steps (median, successes)"] = [cell(value, ".0f") for value in summary["length"]]
     return pd.DataFrame(columns)
 
 

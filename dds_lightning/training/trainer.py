@@ -90,12 +90,22 @@ class BestCheckpoint(ModelCheckpoint):
     """Also keep the checkpoint with the best value of a logged metric, as `best.ckpt` beside `last.ckpt`.
 
     Args:
-        monitor: name of the metric, e.g. `rollout/success`; null keeps none.
+        monitor: name of the metric, e.g. `rollout/score`; null keeps none.
         mode: `max` or `min`.
+        every_n_steps: look after every so many optimiser steps; null looks after validations.
     """
 
-    def __init__(self, monitor: str | None = None, mode: Literal["max", "min"] = "max") -> None:
-        super().__init__(filename="best", monitor=monitor, mode=mode, save_top_k=1, enable_version_counter=False)
+    def __init__(
+        self, monitor: str | None = None, mode: Literal["max", "min"] = "max", every_n_steps: int | None = None
+    ) -> None:
+        super().__init__(
+            filename="best",
+            monitor=monitor,
+            mode=mode,
+            save_top_k=1,
+            enable_version_counter=False,
+            every_n_train_steps=every_n_steps,
+        )
 
 
 def loggers(root: str | Path) -> list[Logger]:

@@ -135,6 +135,20 @@ def test_the_skill_stage_tells_of_random_and_single_skills(tmp_path):
     assert sorted(table["label"].unique()) == ["random", "skill 0", "skill 1", "skill 2"]
 
 
+def test_a_task_without_success_logs_scores_alone(tmp_path):
+    callback = evaluation(selections=["sample", "greedy"], every_n_steps=3)
+    data = Transitions()
+    data.task = replace(TASK, measures_success=False)
+    fit(tmp_path, [callback], lambda: PolicyModule(4, K, hidden_dims=[8]), lambda: data, steps=3)
+    ways = {f"rollout/{key}" for key in ("score", "length", "greedy/score", "greedy/length")}
+    assert set(callback.history[0]) == {"step", *ways}
+    skills = evaluation(every_n_steps=3)
+    segments = Segments()
+    segments.task = data.task
+    fit(tmp_path, [skills], data=lambda: segments, steps=3)
+    assert set(skills.history[0]) == {"step", "rollout/score", "rollout/length", "rollout/best_skill_score"}
+
+
 def test_the_policy_stage_logs_every_way_and_the_data_modules_skill_stays_put(tmp_path):
     module = Transitions()
     before = {name: value.clone() for name, value in module.skill.state_dict().items()}

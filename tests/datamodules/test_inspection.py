@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules.inspection import check_dataset, describe, episode_table, find_datasets
+from datamodules.inspection import BLOCK, check_dataset, describe, dimension_table, episode_table, visits
 from datamodules.trajectories import DataError, Trajectories
 from dds_lightning.tasks import get_task
 
@@ -64,21 +64,49 @@ def test_a_horizon_longer_than_every_episode_fails_the_check(minari_set: Callabl
         check_dataset(f"local:{minari_set()}", LARGE, horizon=13)
 
 
-def test_sets_are_found_with_their_problems(
-    minari_set: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = minari_set()
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "nothing"))
-    for name, text in (("broken-v0", "{"), (".half-written", "{")):
-        (tmp_path / name / "data").mkdir(parents=True)
-        (tmp_path / name / "data" / "metadata.json").write_text(text)
-    found = find_datasets([tmp_path]).set_index("data set")
-    assert sorted(found.index) == ["broken-v0", "set-v0"]
-    assert found.loc["set-v0", "environment"] == "PointMaze_Large-v3"
-    assert found.loc["set-v0", "steps"] == 24
-    assert found.loc["set-v0", "data"] == f"local:{folder}"
-    assert found.loc["set-v0", "problem"] == ""
-    assert "damaged" in found.loc["broken-v0", "problem"]
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    assert len(find_datasets([tmp_path])) == 2  # each once
-    assert find_datasets([tmp_path / "nothing"]).shape == (2, 6)
+def test_dimensions_have_the_names_of_the_task_and_the_moments_of_numpy() -> None:
+    rng = np.random.default_rng(0)
+    task = get_task("hopper-medium")
+    observations = rng.normal(1000.0, 0.01, (BLOCK + 3, 11)).astype(np.float32)  # hard: far from zero, narrow
+    data = one_episode(observations, rng.uniform(-1, 1, (BLOCK + 2, 3)).astype(np.float32))
+    table = dimension_table(data, task)
+    assert table["name"].tolist()[:3] == ["z (m)", "pitch (rad)", "thigh (rad)"]
+    assert table["name"].tolist()[-3:] == ["thigh", "leg", "foot"]
+    exact = observations.astype(np.float64)
+    for name, expected in (("lowest", exact.min(0)), ("mean", exact.mean(0)), ("std", exact.std(0))):
+        np.testing.assert_allclose(table[name][:11], expected, rtol=1e-6)
+    np.testing.assert_allclose(table["highest"][11:], data.actions.max(0))
+    assert set(dimension_table(data, get_task("walker2d-medium"))["name"]) == {""}  # other widths, no names
+
+
+@pytest.mark.parametrize("name", ["pointmaze-large-diverse", "antmaze-large-play", "antmaze-large-play@robotics"])
+@pytest.mark.parametrize("resolution", [1, 4])
+def test_visits_are_counted_where_the_task_puts_them(name: str, resolution: int) -> None:
+    task = get_task(name)
+    rows, columns = len(task.maze_map or ()), len((task.maze_map or ("",))[0])
+    cells = np.random.default_rng(0).uniform((-1.0, -1.0), (rows, columns), (500, 2))  # some lie outside
+    observations = np.zeros((500, task.observation_dim), np.float32)
+    observations[:, :2] = task.cell_to_xy(cells)
+    counts = visits(one_episode(observations, np.zeros((499, task.action_dim), np.float32)), task, resolution)
+    expected = np.zeros((rows * resolution, columns * resolution), int)
+    for i, j in np.floor((cells + 0.5) * resolution).astype(int):
+        if 0 <= i < len(expected) and 0 <= j < len(expected[0]):
+            expected[i, j] += 1
+    assert expected.sum() < 500
+    np.testing.assert_array_equal(counts, expected)
+
+
+def one_episode(observations: np.ndarray, actions: np.ndarray) -> Trajectories:
+    end = np.arange(len(actions)) == len(actions) - 1
+    width = np.ones(actions.shape[1], np.float32)
+    return Trajectories(
+        name="made",
+        observations=observations,
+        actions=actions,
+        rewards=np.zeros(len(actions), np.float32),
+        terminations=end & False,
+        truncations=end,
+        lengths=np.array([len(actions)]),
+        action_low=-width,
+        action_high=width,
+    )

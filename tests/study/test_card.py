@@ -1,39 +1,43 @@
 """The card tells what a stranger must know before using an agent."""
 
 import pandas as pd
+import pytest
 
 from dds_lightning.study.card import agent_card
 from dds_lightning.tasks import get_task
 
+SETTINGS = {
+    "skill": {
+        "model": {"num_skills": 16, "skill_dim": 64},
+        "trainer": {"max_steps": 2500},
+        "data": {"batch_size": 128, "horizon": 10},
+    },
+    "policy": {"model": {"tau": 0.9}, "trainer": {"max_steps": 12000}, "data": {"batch_size": 256}},
+}
 
-def test_the_card_names_task_score_seed_data_settings_and_command():
+
+def card(name, source, success=(True, True, True, False, False, False)):
+    actors = ["AWR policy, sampled"] * 4 + ["random skills"] * 2
     episodes = pd.DataFrame(
         {
-            "actor": ["AWR policy, sampled"] * 4 + ["random skills"] * 2,
-            "label": ["AWR policy, sampled"] * 4 + ["random skills"] * 2,
+            "actor": actors,
+            "label": actors,
             "episode": [0, 1, 2, 3, 0, 1],
-            "success": [True, True, True, False, False, False],
+            "success": pd.array(success, dtype="boolean"),
             "score": [100.0, 100.0, 100.0, 0.0, 0.0, 0.0],
+            "return": [1.0, 1.0, 1.0, 0.0, 0.0, 0.0],
             "length": [300, 310, 320, 800, 800, 800],
         }
     )
-    settings = {
-        "skill": {
-            "model": {"num_skills": 16, "skill_dim": 64},
-            "trainer": {"max_steps": 2500},
-            "data": {"batch_size": 128, "horizon": 10},
-        },
-        "policy": {"model": {"tau": 0.9}, "trainer": {"max_steps": 12000}, "data": {"batch_size": 256}},
-    }
-    card = agent_card(
-        get_task("pointmaze-large-diverse"),
-        episodes,
-        seed=3,
-        data={"source": "collected", "steps": 1000},
-        settings=settings,
-        command="dds run pointmaze-large-diverse --seed=3",
+    data = {"source": source, "steps": 1000}
+    return agent_card(
+        get_task(name), episodes, seed=3, data=data, settings=SETTINGS, command=f"dds run {name} --seed=3"
     )
-    for text in (
+
+
+def test_the_card_names_task_score_seed_data_settings_and_command():
+    text = card("pointmaze-large-diverse", "collected by `dds data collect`")
+    for part in (
         "AWR policy, sampled: 75.0 % of\n4 episodes",
         "95 % interval 30.1 to 95.4",
         "seed 3",
@@ -43,5 +47,36 @@ def test_the_card_names_task_score_seed_data_settings_and_command():
         "`dds run pointmaze-large-diverse --seed=3`",
         "| random skills | 2 | 0.0 |",
         "a skill every 10 steps",
+        "(the skills can be used again). The\ndata were made by a scripted controller of this project; scores are not",
     ):
-        assert text in card
+        assert part in text
+    assert max(map(len, text.splitlines())) < 200
+
+
+@pytest.mark.parametrize(
+    ("name", "source", "known", "whose"),
+    [
+        ("hopper-medium", "d4rl:hopper_medium-v2.hdf5", "one body in one physics", "D4RL's layout (d4rl:hopper_medium"),
+        (
+            "hopper-medium@v5",
+            "minari:mujoco/hopper/medium-v0",
+            "one body",
+            "given by whoever trained it (minari:mujoco",
+        ),
+        ("kitchen-partial", "d4rl:kitchen.hdf5", "4 subtasks (microwave, kettle, light switch, slide cabinet)", "D4RL"),
+        ("antmaze-medium-play", "d4rl:ant.hdf5", "one maze, one start and one goal", "d4rl:ant.hdf5"),
+        ("pointmaze-umaze-diverse", "local:mine", "one maze", "(local:mine)"),
+    ],
+)
+def test_the_last_section_is_about_this_task_and_these_data(name, source, known, whose):
+    success = [None] * 6 if name.startswith("hopper") else [True] * 3 + [False] * 3
+    text = card(name, source, success)
+    limits = " ".join(text.partition("## What it cannot do")[2].split())
+    assert known in limits
+    assert whose in limits
+    assert "scripted controller" not in text
+    paper = get_task(name).paper_score
+    assert ("The paper reports" in text) == (paper is not None)
+    if name.startswith("hopper"):
+        assert "success" not in text
+        assert "normalised score **75.0 ± 25.0** over 4 episodes, mean return 0.8" in text

@@ -25,6 +25,16 @@ from dds_lightning.tasks import get_task
 
 TASK = get_task("pointmaze-umaze-diverse")
 SKILLS = 2
+HOW = {
+    "task": TASK.name,
+    "environment": TASK.env_id,
+    "episodes": 4,
+    "seed": 3,
+    "checkpoint": "last",
+    "noise_scale": 0.5,
+}
+HOW |= {"sampler": "ddim", "temperature": 1.0, "horizon": 5}
+LINE = f"{TASK.name} ({TASK.env_id}): 4 episodes each, seed 3, last checkpoint, decoder noise 0.5 (ddim)"
 
 
 def result() -> RolloutResult:
@@ -86,13 +96,16 @@ def run(tmp_path_factory):
     DDSAgent(skill, policy).save(root / "agent")
     (root / "relabel").mkdir()
     codes = {"code": [0, 1], "share": [0.75, 0.25], "dx": [0.5, -0.1], "dy": [0.0, 0.2], "distance": [0.6, 0.4]}
+    codes["reward"] = [-1.0, -0.5]
     pd.DataFrame(codes).to_csv(root / "relabel" / "codes.csv", index=False)
     for launch, steps in enumerate(([0, 50, 100], [60, 110])):
         folder = root / "skill" / "logs" / f"version_{launch}"
         folder.mkdir(parents=True)
         frame = pd.DataFrame({"step": steps, "train/denoising": [10.0 * launch + s for s in steps]})
+        frame["val/reconstruction_rmse"] = [0.5 / 2**i for i in range(len(steps))]
         frame.to_csv(folder / "metrics.csv", index=False)
-    marker = {"seconds": 65.0, "settings": {"seed": 3}}
+    facts = {"protocol": HOW, "start_value": {"mean": -0.25, "low": -10.0, "high": 0.0}}
+    marker = {"seconds": 65.0, "settings": {"seed": 3}, "facts": facts}
     (root / "evaluate" / "stage.json").write_text(json.dumps(marker))
     return root
 
@@ -117,6 +130,7 @@ def test_the_report_twice_is_the_same_to_the_byte_and_names_every_path(run, made
     out = capsys.readouterr().out
     assert "AWR policy, sampled" in out
     assert "30.1 to 95.4" in out
+    assert LINE in out
     assert f"({TASK.start_cell[0]}, {TASK.start_cell[1]})" in out
     assert all(f"{name}: {path}" in out for name, path in made.items() if name.endswith(("report", "clip")))
     again.print(as_json=True)
@@ -134,6 +148,9 @@ def test_every_file_of_a_maze_report_is_there_and_linked(run, made):
     assert made["clip"].stat().st_size < 1_500_000
     assert "**75.0 %** of 4 episodes" in text
     assert "seed 3" in text
+    assert LINE in text
+    assert "| V at the start, in learning rewards | -0.25 (possible: -10 to 0) |" in text
+    assert "| error of decoded actions (RMSE, held-out segments) | 0.25 |" in text
     assert "1 min 5 s" in text
     assert str(run) not in text
     assert {path.name for path in made.values() if isinstance(path, Path)} >= {
@@ -144,7 +161,7 @@ def test_every_file_of_a_maze_report_is_there_and_linked(run, made):
 
 
 def test_facts_are_plain_json_and_say_where_the_main_contestant_failed(made):
-    facts = {name: made[name] for name in ("task", "main", "table", "failures")}
+    facts = {name: made[name] for name in ("task", "main", "protocol", "table", "failures", "diagnosis")}
     assert json.loads(json.dumps(facts, allow_nan=False)) == facts
     row, column = TASK.start_cell
     assert facts["failures"] == [{"row": row, "column": column, "skill": 0, "episodes": 1, "share": 1.0}]
@@ -152,8 +169,10 @@ def test_facts_are_plain_json_and_say_where_the_main_contestant_failed(made):
 
 
 def test_facts_read_back_from_a_marker_are_told_alike(made):
-    facts = {name: made[name] for name in ("task", "main", "table", "failures")}
-    assert len(told(json.loads(json.dumps(facts)))) == 2
+    facts = {name: made[name] for name in ("task", "main", "protocol", "table", "failures")}
+    assert len(told(json.loads(json.dumps(facts)))) == 3
+    del facts["protocol"]  # a run of an older version
+    assert told(facts)[0] == TASK.name
 
 
 def test_what_a_killed_launch_logged_too_much_is_left_out(run, tmp_path):
@@ -170,7 +189,36 @@ def test_a_task_without_a_maze_has_tables_and_no_maze_figures(run, tmp_path, mon
     made = write_report(tmp_path / "run")
     assert made.keys() & {"trajectories", "clip", "values", "failed_ends"} == set()
     assert made["failures"][0]["row"] is None
-    assert "training" in made
+    assert {"training", "scores"} <= made.keys()
+
+
+def test_a_runner_is_reported_by_score_and_return(run, tmp_path):
+    shutil.copytree(run, tmp_path / "run", ignore=shutil.ignore_patterns("report", "agent"))
+    played = result()
+    table = played.episodes.assign(success=pd.array([None] * 12, dtype="boolean"), final_x=np.nan, final_y=np.nan)
+    RolloutResult("hopper-medium", table).save(tmp_path / "run" / "evaluate")
+    pd.DataFrame({"code": [0, 1], "share": 0.5, "reward": [0.1, 2.0]}).to_csv(tmp_path / "run/relabel/codes.csv")
+    (tmp_path / "run" / "data").mkdir()
+    facts = {"facts": {"scores": {"mean": 45.0, "best": 98.0}}}
+    (tmp_path / "run" / "data" / "stage.json").write_text(json.dumps(facts))
+    made = report(tmp_path / "run")
+    assert {"scores", "training"} <= made.data.keys()
+    assert made.data.keys() & {"trajectories", "failures_table", "failed_ends", "clip", "values"} == set()
+    assert made.data["failures"] == []
+    assert all(row["success"] is None for row in made.data["table"])
+    text = made.data["report"].read_text()
+    assert "success" not in text
+    assert "Where failed episodes ended" not in text
+    assert "**AWR policy, sampled**: normalised score **75.0 ± 25.0** over 4 episodes, mean return 0.8" in text
+    assert "The paper reports 84.7, measured with D4RL's data" in text
+    assert [row["who"] for row in made.data["diagnosis"]["scores"]] == [
+        "the data, mean episode",
+        "the data, best episode",
+        "behaviour cloning",
+        "best single skill (all alike)",
+        "AWR policy, sampled",
+    ]
+    assert any("The paper reports 84.7" in str(line) for line in made.text)
 
 
 def test_without_paths_agent_or_logs_the_rest_is_still_told(tmp_path):

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from dds_lightning.reports import plain
 from dds_lightning.study.tables import (
     ends,
     failures_table,
@@ -17,7 +18,7 @@ from dds_lightning.study.tables import (
 )
 from dds_lightning.tasks import get_task
 
-LARGE = get_task("pointmaze-large-diverse")
+LARGE, HOPPER, KITCHEN = (get_task(name) for name in ("pointmaze-large-diverse", "hopper-medium", "kitchen-partial"))
 
 
 @pytest.mark.parametrize(
@@ -69,6 +70,7 @@ def episodes() -> pd.DataFrame:
                 "success": success,
                 "length": length,
                 "score": score,
+                "return": score / 100,
                 "final_x": x,
                 "final_y": y,
                 "final_code": code,
@@ -98,6 +100,51 @@ def test_summary_numbers_of_one_contestant():
     assert row["score"] == 75.0
     assert row["score_error"] == pytest.approx(25.0)  # 50 / sqrt(4)
     assert (row["success_low"], row["success_high"]) == pytest.approx((30.0642, 95.4413), abs=1e-3)
+    assert (row["return"], row["steps"]) == (0.75, 485.0)  # of all episodes, failures too
+
+
+def runs() -> pd.DataFrame:
+    """A runner's episodes, whose task measures no success: a policy, and two skills of two episodes each."""
+    table = pd.DataFrame(
+        [("policy", "policy", 90.0, 2900.0, 990, 1), ("policy", "policy", 70.0, 2300.0, 800, 2)]
+        + [
+            ("single skill", f"skill {k % 2}", score, 30 * score, 500, k % 2)
+            for k, score in enumerate((10.0, 50.0, 20.0, 30.0))
+        ],
+        columns=["actor", "label", "score", "return", "length", "final_code"],
+    )
+    return table.assign(success=pd.array([None] * 6, dtype="boolean"), final_x=np.nan, final_y=np.nan)
+
+
+def test_without_success_the_score_ranks_and_success_stays_unknown():
+    table = summary_table(runs())
+    assert table["contestant"][2] == "best single skill (skill 1)"
+    assert table.loc[2, "score"] == 40.0
+    assert table[["success", "success_low", "success_high", "length"]].isna().all(axis=None)
+    assert table.loc[0, ["score", "score_error", "return", "steps"]].tolist() == [80.0, 10.0, 2600.0, 895.0]
+
+
+def test_nothing_fails_where_success_is_not_measured():
+    assert len(failures_table(runs(), HOPPER)) == 0
+
+
+def test_each_family_is_printed_by_the_numbers_it_is_judged_by():
+    runner = readable(summary_table(runs()), HOPPER)
+    assert runner.columns.tolist() == ["contestant", "episodes", "score", "return", "steps (mean)"]
+    assert runner.iloc[0].tolist() == ["policy", 2, "80.0 ± 10.0", "2600.0", "895"]
+    kitchen = episodes().assign(**{"return": [4.0, 4.0, 2.0, 4.0, *[0.0, 1.0] * 2, *[1.0] * 4]})
+    shown = readable(summary_table(kitchen), KITCHEN)
+    expected = ["contestant", "episodes", "score", "subtasks done, of 4", "all 4, %", "95 % interval"]
+    assert shown.columns.tolist() == [*expected, "steps (median, successes)"]
+    assert shown.iloc[0].tolist()[2:5] == ["75.0 ± 25.0", "3.50", "75.0"]
+
+
+def test_tables_read_back_from_json_are_printed_alike():
+    """A marker holds None for what is missing, where the table has NaN."""
+    for task, played in ((LARGE, episodes()), (HOPPER, runs())):
+        summary = summary_table(played)
+        again = pd.DataFrame(plain(summary))
+        pd.testing.assert_frame_equal(readable(again, task), readable(summary, task), check_dtype=False)
 
 
 def test_no_best_part_where_all_are_alike():
@@ -148,6 +195,13 @@ def test_skills_table_joins_data_choices_and_replays():
     assert math.isnan(table["alone"][2])
 
 
+def test_skills_table_of_a_runner_tells_rewards_and_scores():
+    data = pd.DataFrame({"code": [0, 1], "share": [0.5, 0.5], "reward": [0.3, 3.1], "dx": 0.0})
+    table = skills_table([[1]], data, runs()[2:], effects=("reward",))
+    assert table.columns.tolist() == ["skill", "in data", "chosen", "reward", "alone"]
+    assert table["alone"].tolist() == [15.0, 40.0]
+
+
 def test_skills_table_without_data_or_replays():
     table = skills_table([[], [2]], None, None)
     assert table.columns.tolist() == ["skill", "chosen"]
@@ -156,7 +210,7 @@ def test_skills_table_without_data_or_replays():
 
 
 def test_printed_table_and_its_markdown():
-    shown = readable(summary_table(episodes()))
+    shown = readable(summary_table(episodes()), LARGE)
     assert shown.iloc[0].tolist() == ["policy", 4, "75.0", "30.1 to 95.4", "75.0 ± 25.0", "340"]
     assert shown.iloc[5]["steps (median, successes)"] == "-"
     text = markdown(pd.DataFrame({"a|b": ["x|y"], "n": [1.25]}), {"n": ".1f"})

@@ -1,0 +1,157 @@
+"""The commands about published agents: the signature is the command line, the docstring the help."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from dds_lightning.errors import UserError
+from dds_lightning.reports import Report, pairs, table
+
+
+def publish(
+    run: str,
+    place: str,
+    skill: str | None = None,
+    policy: str | None = None,
+    task: str | None = None,
+    card: str | None = None,
+    public: bool = False,
+) -> Report:
+    """Make a directory of an agent that others can load and trust, or push it to the Hugging Face hub.
+
+    The directory holds the weights (safetensors), settings, scores, a card and the hashes of all files; nothing in
+    it is ever run. It is verified before it takes its place.
+
+    Args:
+        run: a run of `dds run` or a directory that is published already; "-" with --skill
+        place: a new directory, or hf:OWNER/NAME
+        skill: skill checkpoint (.ckpt) instead of a run
+        policy: policy checkpoint (.ckpt) to go with it
+        task: name of the task to keep with it; without it the run's
+        card: a text file for README.md; without it the run's own card
+        public: let everybody see a new repository on the hub
+    """
+    from dds_lightning.agent import DDSAgent
+    from dds_lightning.hub import is_hub, push
+    from dds_lightning.publishing import CARD, load_published
+    from dds_lightning.study.contestants import agent_directory
+    from dds_lightning.tasks import get_task
+    from dds_lightning.verification import verify_published
+
+    if (run == "-") != (skill is not None):
+        raise UserError(f"run is '{run}' and --skill is {skill}: give a run, or - and --skill CHECKPOINT")
+    if policy is not None and skill is None:
+        raise UserError(f"--policy is {policy} without --skill: give both")
+    if task is not None:
+        get_task(task)
+    text = None if card is None else _text(card)
+    if skill is not None:
+        from dds_lightning.policy import PolicyModule
+        from dds_lightning.skill import SkillModule
+
+        decides = None if policy is None else PolicyModule.load(policy)
+        agent = DDSAgent(SkillModule.load(skill), decides, "random" if decides is None else "sample")
+        about, metrics = {"task": task}, None
+    else:
+        source = agent_directory(Path(run))
+        published = load_published(source)
+        agent = DDSAgent.load(source)
+        about, metrics = {"task": task or published.config.get("task")}, dict(published.metrics)
+        text = (source / CARD).read_text(encoding="utf-8") if text is None else text
+    if is_hub(place):
+        import tempfile
+
+        with tempfile.TemporaryDirectory() as folder:
+            made = agent.save(Path(folder) / "agent", metrics=metrics, card=text, **about)
+            facts = {**verify_published(made), "directory": push(made, place, private=not public)}
+    else:
+        facts = verify_published(agent.save(place, metrics=metrics, card=text, **about))
+    return Report(facts, [pairs(facts.items()), f'load it with DDSAgent.load("{place}")'])
+
+
+def list_(root: list[str] = ["checkpoints", "runs"]) -> Report:  # noqa: B006 - jsonargparse shows the default
+    """List published agents under some folders, with what is wrong with them, if anything.
+
+    Args:
+        root: folders to look in
+    """
+    from dds_lightning.verification import find_published
+
+    found = find_published(root)
+    if found.empty:
+        return Report(found, [f"no published agents in {', '.join(root)}; `dds run` and `dds publish` make some"])
+    return Report(found, [table(found)])
+
+
+def verify(directory: str) -> Report:
+    """Look at everything in a published directory: hashes, header, shapes, finite numbers, known answers.
+
+    Ends with status 2 and what is wrong if it is not sound.
+
+    Args:
+        directory: as published, or hf:OWNER/NAME
+    """
+    from dds_lightning.hub import is_hub, pull
+    from dds_lightning.verification import verify_published
+
+    facts = verify_published(pull(directory) if is_hub(directory) else directory)
+    return Report(facts, [f"{directory} is sound: {_words(facts)}"])
+
+
+def export(
+    directory: str,
+    out: str | None = None,
+    format: Literal["onnx", "torch"] = "onnx",
+    selection: Literal["sample", "greedy", "argmax_q"] | None = None,
+    temperature: float | None = None,
+    noise_scale: float | None = None,
+) -> Report:
+    """Write an agent as one file that acts without this package, and compare both.
+
+    The file takes observations, codes in use (-1: choose), Gumbel noise for the choice and Gaussian noise for the
+    decoder, and gives actions and codes; its metadata hold horizon and sizes. `dds_lightning/examples` has a program
+    that acts with it.
+
+    Args:
+        directory: a run of `dds run`, a published directory, or hf:OWNER/NAME
+        out: the file; without it NAME.onnx or NAME.pt2 in the current folder
+        format: onnx (any language), or torch (`torch.export.load`)
+        selection: how skills are chosen; without it as the agent does
+        temperature: of sampling; without it the agent's
+        noise_scale: of the decoder; without it the agent's
+    """
+    from dds_lightning.agent import DDSAgent
+    from dds_lightning.export import SUFFIXES, check_exported, describe, export_agent
+    from dds_lightning.hub import is_hub, pull
+    from dds_lightning.publishing import load_published
+    from dds_lightning.study.contestants import agent_directory
+
+    source = pull(directory) if is_hub(directory) else agent_directory(Path(directory))
+    chosen = {"selection": selection, "temperature": temperature, "noise_scale": noise_scale}
+    agent = DDSAgent.load(source, **{name: value for name, value in chosen.items() if value is not None})
+    task = load_published(source).config.get("task")
+    name = Path(directory.removeprefix("hf:")).name
+    path = export_agent(agent, out or f"{name}{SUFFIXES[format]}", format, task=task)
+    found = check_exported(agent, path)
+    facts = {"file": str(path), "format": format, "megabytes": round(path.stat().st_size / 1e6, 2)}
+    data = {**facts, **describe(agent, task), **found}
+    times = {
+        "largest difference": f"{found['difference']:.1g}",
+        "one act, the file": f"{found['file_ms']['median']:.2f} ms (95 %: {found['file_ms']['p95']:.2f})",
+        "one act, the agent": f"{found['agent_ms']['median']:.2f} ms (95 %: {found['agent_ms']['p95']:.2f})",
+    }
+    return Report(data, [pairs({**facts, **describe(agent, task), **times}.items())])
+
+
+def _words(fact: dict[str, Any]) -> str:
+    golden = fact["golden"]
+    answers = "it stores no answers to compare" if golden is None else f"answers as published (within {golden:.1g})"
+    return f"task {fact['task']}, {fact['parameters']:,} parameters, {fact['num_skills']} skills; {answers}"
+
+
+def _text(card: str) -> str:
+    try:
+        return Path(card).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"--card: {card} cannot be read as text ({error})") from error

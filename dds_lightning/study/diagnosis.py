@@ -1,0 +1,100 @@
+"""Where a run loses: what the data hold, what a copy of them reaches, one skill alone, and the choice of skills.
+
+```
+ data ──► behaviour cloning        what actions alone give
+   └────► skills ──► one skill     what the decoder gives
+             └─────► policy        what choosing adds
+```
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pandas as pd
+
+from dds_lightning.study.tables import BEST
+from dds_lightning.tasks import Task
+
+if TYPE_CHECKING:
+    from datamodules.trajectories import Trajectories
+    from dds_lightning.study.findings import Findings
+
+
+def behaviour_scores(trajectories: Trajectories, task: Task) -> dict[str, float]:
+    """How well the behaviour policy did, as an evaluation would score it.
+
+    In the kitchen the data's rewards count at every step, an evaluation only once: there the subtasks that an
+    episode gets done are counted.
+
+    Returns:
+        `mean` and `best` normalised score of an episode.
+    """
+    if task.subtasks:
+        from datamodules.sources.subtasks import subtasks_completed
+
+        scores = task.normalised_score(subtasks_completed(trajectories, task))
+    else:
+        scores = task.normalised_score(trajectories.returns)
+    return {"mean": round(float(scores.mean()), 2), "best": round(float(scores.max()), 2)}
+
+
+def diagnose(found: Findings, logs: Mapping[str, Path]) -> dict[str, pd.DataFrame]:
+    """The small tables of the report's section on where the run loses; what nobody measured is left out.
+
+    Args:
+        found: what the run found.
+        logs: "skill" and "policy" to the metrics.csv of their training.
+
+    Returns:
+        `scores`: one row a step from data to policy, columns `who` and `score` (normalised); `measures`: columns
+        `measure` and `value`, numbers of the two trainings and of the critic at the start.
+    """
+    return {"scores": _scores(found), "measures": _measures(found, logs)}
+
+
+def _scores(found: Findings) -> pd.DataFrame:
+    data = found.facts("data").get("scores", {})
+    rows = [(f"the data, {which} episode", data[which]) for which in ("mean", "best") if which in data]
+    summary = found.summary
+    chosen = summary["contestant"].isin(["behaviour cloning", "random skills", found.main]) | (summary["kind"] == BEST)
+    ladder = {"behaviour cloning": 0, "random skills": 1, found.main: 3}  # the best single skill between them
+    played = sorted(
+        summary.loc[chosen, ["contestant", "score"]].itertuples(index=False),
+        key=lambda row: ladder.get(str(row.contestant), 2),
+    )
+    rows += [(str(row.contestant), float(row.score)) for row in played]
+    return pd.DataFrame(rows, columns=["who", "score"])
+
+
+def _measures(found: Findings, logs: Mapping[str, Path]) -> pd.DataFrame:
+    rows: list[tuple[str, str]] = []
+
+    def logged(stage: str, column: str, name: str, form: str, factor: float = 1.0) -> None:
+        value = _last(logs.get(stage), column)
+        if not math.isnan(value):
+            rows.append((name, format(factor * value, form)))
+
+    held_out = "held-out segments"
+    logged("skill", "val/reconstruction_rmse", f"error of decoded actions (RMSE, {held_out})", ".3g")
+    logged("skill", "val/codes_used", f"codes in use ({held_out})", ".0f")
+    logged("policy", "val/clipped_share", "AWR weights that are clipped, %", ".1f", 100.0)
+    logged("policy", "val/code_accuracy", "agreement of the policy with the data's codes, %", ".0f", 100.0)
+    start = found.facts("evaluate").get("start_value")
+    if start:
+        bounds = [start["low"], start["high"]]
+        possible = "" if None in bounds else f" (possible: {bounds[0]:.3g} to {bounds[1]:.3g})"
+        rows.append(("V at the start, in learning rewards", f"{start['mean']:.3g}{possible}"))
+    return pd.DataFrame(rows, columns=["measure", "value"])
+
+
+def _last(path: Path | None, column: str) -> float:
+    """The last logged value of a column; NaN where there is none."""
+    if path is None:
+        return math.nan
+    table = pd.read_csv(path)
+    values = table[column].dropna().tolist() if column in table else []
+    return float(values[-1]) if values else math.nan

@@ -1,0 +1,133 @@
+"""How an agent was evaluated, in one line for people and as numbers for programs, and which checkpoint it was."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dds_lightning.seating import episode_seed
+from dds_lightning.tasks import Task
+from dds_lightning.tasks.facts import PAPERS_DATA
+
+if TYPE_CHECKING:
+    from dds_lightning.agent import DDSAgent
+
+LAST, BEST = "last", "best"
+
+
+def protocol(
+    task: Task,
+    agent: DDSAgent,
+    *,
+    episodes: int,
+    seed: int,
+    temperature: float = 1.0,
+    checkpoint: str = LAST,
+    best: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Everything a score depends on beside the weights.
+
+    Args:
+        task: what is played, in its variant.
+        agent: who plays.
+        episodes: of each contestant.
+        seed: of environments and agents.
+        temperature: of sampled codes.
+        checkpoint: "last", "best" or "last and best".
+        best: facts of the best checkpoint, see `best_facts`, where it plays too.
+
+    Returns:
+        Plain values: `task` (with its variant), `environment`, `episodes`, `seed`, `checkpoint`, `noise_scale`
+        (factor on the decoder's noise), `sampler` (of the decoder; None for one without noise), `temperature`,
+        `horizon` (steps of a skill), `max_episode_steps`, `score_min` and `score_max` (returns that score 0
+        and 100), `paper_score` (None where the paper has none), `best` (None without).
+    """
+    settings = agent.skill.hparams
+    return {
+        "task": full_name(task),
+        "environment": task.env_id,
+        "episodes": episodes,
+        "seed": seed,
+        "checkpoint": checkpoint,
+        "noise_scale": float(settings["noise_scale"] if agent.noise_scale is None else agent.noise_scale),
+        "sampler": settings["sampler"] if settings["decoder"] == "diffusion" else None,
+        "temperature": temperature,
+        "horizon": agent.horizon,
+        "max_episode_steps": task.max_episode_steps,
+        "score_min": task.score_min,
+        "score_max": task.score_max,
+        "paper_score": task.paper_score,
+        "best": dict(best) if best else None,
+    }
+
+
+def full_name(task: Task) -> str:
+    """A task's name with its variant, as it can be typed."""
+    return f"{task.base_name}@{task.physics}" if task.physics else task.name
+
+
+def heading(facts: Mapping[str, Any]) -> str:
+    """A protocol as the one line above its table."""
+    decoder = "decoder without noise"
+    if facts["sampler"] is not None:
+        decoder = f"decoder noise {facts['noise_scale']:g} ({facts['sampler']})"
+    return (
+        f"{facts['task']} ({facts['environment']}): {facts['episodes']} episodes each, seed {facts['seed']}, "
+        f"{facts['checkpoint']} checkpoint, {decoder}, temperature {facts['temperature']:g}, a skill every "
+        f"{facts['horizon']} steps"
+    )
+
+
+def paper_line(task: Task) -> str | None:
+    """What the paper reports for a task and why it may not be comparable; None where it reports nothing."""
+    return None if task.paper_score is None else f"The paper reports {task.paper_score:.1f}, {PAPERS_DATA}."
+
+
+def best_facts(last: Path, best: Path) -> dict[str, Any]:
+    """How a training chose its best checkpoint, read from its two files.
+
+    Args:
+        last: the training's last checkpoint; it knows every evaluation.
+        best: the checkpoint that was kept.
+
+    Returns:
+        `monitor` (name of the metric), `value`, `step` and `evaluations`, the number of them that the best was
+        chosen from (None where the metric is no rollout's).
+    """
+    from dds_lightning.checkpointing import load_ckpt
+
+    checkpoint = load_ckpt(best)
+    kept = next(state for key, state in checkpoint["callbacks"].items() if key.startswith("BestCheckpoint"))
+    evaluated = load_ckpt(last)["callbacks"].get("RolloutEvaluation", {"history": []})
+    count = sum(kept["monitor"] in row for row in evaluated["history"])
+    return {
+        "monitor": kept["monitor"],
+        "value": float(kept["best_model_score"]),
+        "step": int(checkpoint["global_step"]),
+        "evaluations": count or None,
+    }
+
+
+def start_value(task: Task, agent: DDSAgent, seed: int, episodes: int = 10) -> dict[str, float] | None:
+    """What the critic promises where episodes start, in discounted learning rewards.
+
+    Returns:
+        `mean` of V over the starts of some evaluation episodes, and `low` and `high`, what rewards and discounts
+        of the data allow at all; None for an agent without a policy.
+    """
+    import torch
+
+    if agent.policy is None:
+        return None
+    env = task.make_env()
+    try:
+        starts = np.stack([env.reset(seed=episode_seed(seed, i))[0] for i in range(episodes)])
+    finally:
+        env.close()
+    with torch.inference_mode():
+        values = agent.policy.v(torch.from_numpy(starts).to(agent.device))
+    low, high = agent.policy.value_range.tolist()
+    return {"mean": float(values.mean()), "low": low, "high": high}

@@ -1,0 +1,64 @@
+"""Which family has a collector, and how given data are told from changed ones."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from datamodules.collect.collectors import COLLECTORS, collect, refuse_uncollectable
+from datamodules.signature import locate, signature
+from dds_lightning.errors import UserError
+from dds_lightning.tasks import get_task, task_names
+
+
+def test_each_family_has_a_collector_that_can_be_imported_or_says_where_data_come_from(monkeypatch):
+    import importlib
+
+    for module, name in COLLECTORS.values():
+        assert callable(getattr(importlib.import_module(module), name))
+    monkeypatch.setattr("datamodules.collect.collectors.COLLECTORS", {})
+    for name in task_names():
+        with pytest.raises(UserError, match=rf"'{name}'.*d4rl:FILE.*minari:ID.*dds data fetch {name}"):
+            refuse_uncollectable(get_task(name))
+
+
+def test_collecting_goes_to_the_collector_of_the_family(monkeypatch):
+    import datamodules.collect.pointmaze as module
+
+    def collector(*given, **options):
+        return given, options
+
+    monkeypatch.setattr(module, "collect_pointmaze", collector)
+    task = get_task("pointmaze-umaze-play")
+    given, options = collect(task.name, 100, 3, "out", 2, dataset_id="mine")
+    assert given == (task, 100, 3, "out", 2)
+    assert options == {"dataset_id": "mine", "overwrite": False}
+
+
+def test_a_signature_changes_with_names_sizes_and_times(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    monkeypatch.setenv("D4RL_DATASET_DIR", str(tmp_path / "d4rl"))
+    file = tmp_path / "set" / "data.hdf5"
+    file.parent.mkdir()
+    file.write_bytes(b"abc")
+    (tmp_path / "d4rl").mkdir()
+    (tmp_path / "d4rl" / "one.hdf5").write_bytes(b"abc")
+    specs = [f"local:{tmp_path}/set", "minari:set", f"d4rl:{file}", "d4rl:one.hdf5", f"arrays:{tmp_path}/set"]
+    before = {spec: signature(spec) for spec in specs}
+    assert before == {spec: signature(spec) for spec in specs}
+    assert before["local:" + str(tmp_path / "set")] == before["minari:set"]
+    os.utime(file, ns=(1, 1))
+    changed = [spec for spec in specs if signature(spec) != before[spec]]
+    assert changed == [spec for spec in specs if spec != "d4rl:one.hdf5"]
+    assert locate("d4rl:one.hdf5") == tmp_path / "d4rl" / "one.hdf5"
+
+
+@pytest.mark.parametrize(
+    "spec", ["local:nowhere", "minari:nowhere", "d4rl:no/where.hdf5", "ftp:there", "local:", "d4rl:"]
+)
+def test_what_is_not_there_is_said_in_one_sentence(spec):
+    with pytest.raises(UserError, match=r"nothing at|missing"):
+        signature(spec)
+    assert list(Path().iterdir()) == []
