@@ -256,10 +256,9 @@ class DDSAgent(nn.Module):
         skill = self.skill.eval()
         observations = skill.normaliser.mean + skill.normaliser.std * wave  # (8, O), as the data are spread
         codes = torch.arange(rows, device=self.device) % self.num_skills
-        count = skill.decoder.draws * rows * self.action_dim
+        count = skill.draws * rows * self.action_dim
         noise = torch.arange(count, device=self.device).reshape(-1, rows, self.action_dim).float().cos()
-        unit = skill.decoder.denoise(noise, skill.normaliser(observations), skill.bottleneck.lookup(codes))
-        answers = {"actions": skill.action_box.from_unit(unit)}
+        answers = {"actions": skill.decode_from(observations, codes, noise)}
         if self.policy is not None:
             answers["logits"] = self.policy.eval().logits(observations).nan_to_num(neginf=0.0)
         return {name: [[round(x, 6) for x in row] for row in answer.tolist()] for name, answer in answers.items()}

@@ -81,9 +81,7 @@ class ActingGraph(nn.Module):
         else:
             scores = self.policy.logits(observations) / self.temperature
         codes = torch.where(codes < 0, (scores + gumbel).argmax(dim=-1), codes)
-        vectors = self.skill.bottleneck.lookup(codes)
-        unit = self.skill.decoder.denoise(self.noise_scale * noise, self.skill.normaliser(observations), vectors)
-        return self.skill.action_box.from_unit(unit), codes
+        return self.skill.decode_from(observations, codes, self.noise_scale * noise), codes
 
 
 def describe(agent: DDSAgent, task: str | None = None) -> dict[str, Any]:
@@ -95,7 +93,7 @@ def describe(agent: DDSAgent, task: str | None = None) -> dict[str, Any]:
         "num_skills": agent.num_skills,
         "observation_dim": agent.observation_dim,
         "action_dim": agent.action_dim,
-        "draws": agent.skill.decoder.draws,
+        "draws": agent.skill.draws,
         "noise_scale": graph.noise_scale,
         "selection": agent.selection,
         "temperature": agent.temperature,
@@ -132,7 +130,7 @@ def export_agent(agent: DDSAgent, path: str | Path, format: Format = "onnx", *, 
             program = torch.export.export(graph, example, dynamic_shapes=shapes)
             torch.export.save(program, part, extra_files={FACTS: facts})
         else:
-            program = torch.onnx.export(
+            made = torch.onnx.export(
                 graph,
                 example,
                 input_names=list(INPUTS),
@@ -141,9 +139,9 @@ def export_agent(agent: DDSAgent, path: str | Path, format: Format = "onnx", *, 
                 dynamo=True,
                 external_data=False,
             )
-            assert program is not None, "the dynamo exporter returns a program"
-            program.model.metadata_props[FACTS] = facts
-            program.save(part, external_data=False)
+            assert made is not None, "the dynamo exporter returns a program"
+            made.model.metadata_props[FACTS] = facts
+            made.save(part, external_data=False)
     return path
 
 
@@ -154,7 +152,7 @@ def example_inputs(agent: DDSAgent, batch: int, seed: int = 0) -> tuple[Tensor, 
         torch.randn(batch, agent.observation_dim, generator=stream),
         torch.full((batch,), -1),
         torch.zeros(batch, agent.num_skills),
-        torch.randn(agent.skill.decoder.draws, batch, agent.action_dim, generator=stream),
+        torch.randn(agent.skill.draws, batch, agent.action_dim, generator=stream),
     )
 
 

@@ -242,6 +242,18 @@ class SkillModule(StageModule):
         scale = self.hparams.noise_scale if noise_scale is None else noise_scale
         return self.action_box.from_unit(self.decoder.sample(self.normaliser(observations), vectors, scale, generator))
 
+    @property
+    def draws(self) -> int:
+        """N, Gaussians that the decoder draws for one action."""
+        return int(self.decoder.draws)
+
+    def decode_from(self, observations: Tensor, codes: Tensor, noise: Tensor) -> Tensor:
+        """`decode` with given noise (N, B, A), the noise scale included: a function of its arguments."""
+        assert isinstance(self.bottleneck, Codebook), "codes belong to a codebook"
+        vectors = self.bottleneck.lookup(codes)
+        decoder: Any = self.decoder
+        return self.action_box.from_unit(decoder.denoise(noise, self.normaliser(observations), vectors))
+
     def _discrete(self, skill: Quantised | GaussianSkill) -> Quantised:
         if not isinstance(skill, Quantised):
             raise UserError("bottleneck is gaussian: its skills have no codes; train with bottleneck: vq")

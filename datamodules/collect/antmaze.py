@@ -113,7 +113,6 @@ def collect_antmaze(
         "controller": sha256(SHIPPED / "ant" / f"{task.physics}.safetensors"),
     }
     kept = Kept(folder, made_from)
-    kept.open()
     env = recorder.env()
     assert env.spec is not None, "made by its id"
     write_minari(

@@ -8,19 +8,23 @@ from pathlib import Path
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import Task, get_task
 
-COLLECTORS = {"pointmaze": ("datamodules.collect.pointmaze", "collect_pointmaze")}
-"""Family -> module and name of a function `(task, steps, seed, out, workers, *, dataset_id, overwrite) -> Path`."""
+COLLECTORS = {
+    ("pointmaze", ""): ("datamodules.collect.pointmaze", "collect_pointmaze"),
+    ("antmaze", "d4rl"): ("datamodules.collect.antmaze", "collect_antmaze"),
+}
+"""Family and physics -> module and name of a function `(task, steps, seed, out, workers, *, dataset_id, overwrite)`."""
 
 
 def refuse_uncollectable(task: Task) -> None:
     """Say where data come from for a task that cannot be collected.
 
     Raises:
-        UserError: There is no collector for the task's family.
+        UserError: There is no collector for the task's family and physics.
     """
-    if task.family not in COLLECTORS:
+    if (task.family, task.physics) not in COLLECTORS:
+        known = ", ".join(f"{family}-...{f'@{physics}' if physics else ''}" for family, physics in COLLECTORS)
         raise UserError(
-            f"data: nothing collects data for task '{task.name}' yet, only for {', '.join(COLLECTORS)}: give --data "
+            f"data: nothing collects data for task '{task.name}' yet, only for {known}: give --data "
             f"d4rl:FILE or --data minari:ID, or get D4RL's own with `dds data fetch {task.base_name}`"
         )
 
@@ -54,6 +58,6 @@ def collect(
     """
     task = get_task(task) if isinstance(task, str) else task
     refuse_uncollectable(task)
-    module, name = COLLECTORS[task.family]
+    module, name = COLLECTORS[task.family, task.physics]
     collector = getattr(importlib.import_module(module), name)
     return collector(task, steps, seed, out, workers, dataset_id=dataset_id, overwrite=overwrite)

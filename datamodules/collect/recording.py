@@ -66,6 +66,8 @@ def record(
     """
     if workers is not None and workers < 1:
         raise UserError(f"workers: found {workers}, expected at least 1, or none for every core")
+    if kept is not None:
+        kept.open()
     parcels = range(0, recorder.rounds, parcel)
     missing = [first for first in parcels if kept is None or not kept.has(first)]
     workers = min(workers or _cores(), max(len(missing), 1))

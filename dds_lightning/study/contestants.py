@@ -95,12 +95,16 @@ def final_table(
 
 def behaviour_controller(task: Task) -> Any:
     """The actor that made a collected set, with the noise that it had there; None where there is none."""
-    if task.family != "pointmaze":
-        return None
-    from datamodules.collect.behaviour import BehaviourNoise
-    from datamodules.collect.pointmaze import WaypointController
+    if task.family == "pointmaze":
+        from datamodules.collect.behaviour import BehaviourNoise
+        from datamodules.collect.pointmaze import WaypointController
 
-    return EveryRow(WaypointController(task, BehaviourNoise()))
+        return EveryRow(WaypointController(task, BehaviourNoise()))
+    if task.family == "antmaze" and task.physics == "d4rl":
+        from datamodules.collect.antmaze import AntMazeRecipe, AntNavigator
+
+        return EveryRow(AntNavigator(task, AntMazeRecipe()))
+    return None
 
 
 class EveryRow:

@@ -1,0 +1,149 @@
+"""The actor of a trained behaviour policy in NumPy: a file of a few kilobytes, no torch needed to act.
+
+Collectors run it in worker processes, where importing torch would cost a second and hundreds of megabytes each.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from datamodules.validation import DataError
+from dds_lightning.files import written_whole
+
+FORMAT = "1"
+OBSERVATION_CLIP = 10.0
+"""Normalised observations are cut here, in training and afterwards."""
+ACTIVATIONS = ("tanh", "relu")
+OUTPUTS = ("clip", "tanh")
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class MLPPolicy:
+    """A Gaussian policy whose mean is a multilayer perceptron of the normalised observation.
+
+    Attributes:
+        weights: One (inputs, outputs) matrix a layer.
+        biases: One (outputs,) vector a layer.
+        mean: (O,) subtracted from observations.
+        std: (O,) divides them; the quotient is cut to +-10.
+        log_std: (A,) logarithm of the deviation with which the policy explored when it was saved, added before
+            `output`.
+        activation: Between layers: "tanh" or "relu".
+        output: How the last layer becomes an action in [-1, 1]: "clip" (PPO) or "tanh" (SAC).
+        metadata: What it was trained on: environment, algorithm, steps, score.
+    """
+
+    weights: tuple[Array, ...]
+    biases: tuple[Array, ...]
+    mean: Array
+    std: Array
+    log_std: Array
+    activation: str = "tanh"
+    output: str = "clip"
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+
+    def act(self, observations: ArrayLike, rng: np.random.Generator | None = None) -> Array:
+        """Actions of a batch.
+
+        Args:
+            observations: (..., O).
+            rng: Draws from the policy as it explored in training; without one, its mean is taken.
+
+        Returns:
+            (..., A) float32 in [-1, 1].
+        """
+        observations = np.asarray(observations, dtype=np.float32)
+        x = np.clip((observations - self.mean) / self.std, -OBSERVATION_CLIP, OBSERVATION_CLIP)
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            x = x @ weight + bias
+            x = np.tanh(x) if self.activation == "tanh" else np.maximum(x, 0.0)
+        x = x @ self.weights[-1] + self.biases[-1]
+        if rng is not None:
+            x = x + np.exp(self.log_std) * rng.standard_normal(x.shape, dtype=np.float32)
+        return np.clip(x, -1.0, 1.0) if self.output == "clip" else np.tanh(x)
+
+    def save(self, path: str | Path) -> Path:
+        """Write a safetensors file; `metadata` travels in its header as JSON."""
+        from safetensors.numpy import save_file
+
+        tensors = {"mean": self.mean, "std": self.std, "log_std": self.log_std}
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            tensors |= {f"layers.{i}.weight": weight, f"layers.{i}.bias": bias}
+        tensors = {key: np.ascontiguousarray(value, dtype=np.float32) for key, value in tensors.items()}
+        header = {
+            "format": FORMAT,
+            "activation": self.activation,
+            "output": self.output,
+            "metadata": json.dumps(dict(self.metadata)),
+        }
+        with written_whole(Path(path)) as part:
+            save_file(tensors, part, metadata=header)
+        return Path(path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> MLPPolicy:
+        """Read what `save` wrote.
+
+        Raises:
+            DataError: The file is missing, damaged or not a behaviour policy.
+        """
+        from safetensors import SafetensorError, safe_open
+
+        path = Path(path).expanduser()
+        try:
+            with safe_open(path, framework="numpy") as file:
+                header = file.metadata() or {}
+                arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118, it is no mapping
+            metadata = json.loads(header.get("metadata", "{}"))
+        except (OSError, SafetensorError, ValueError) as error:
+            raise DataError(
+                f"behaviour policy {path}: missing or damaged ({error}); train or fetch it again"
+            ) from error
+        layers = range(sum(key.endswith(".weight") for key in arrays))
+        try:
+            policy = cls(
+                weights=tuple(arrays[f"layers.{i}.weight"] for i in layers),
+                biases=tuple(arrays[f"layers.{i}.bias"] for i in layers),
+                mean=arrays["mean"],
+                std=arrays["std"],
+                log_std=arrays["log_std"],
+                activation=header["activation"],
+                output=header["output"],
+                metadata=metadata,
+            )
+        except KeyError as error:
+            raise DataError(
+                f"behaviour policy {path}: it has no {error}, expected a file that MLPPolicy.save wrote; train it again"
+            ) from error
+        policy._check(header.get("format"), path)
+        return policy
+
+    def _check(self, version: str | None, path: Path) -> None:
+        """Refuse shapes that do not follow from each other, and words that mean nothing here."""
+        if version != FORMAT or self.activation not in ACTIVATIONS or self.output not in OUTPUTS:
+            raise DataError(
+                f"behaviour policy {path}: format {version}, activation '{self.activation}', output '{self.output}', "
+                f"expected format {FORMAT}, one of {ACTIVATIONS} and one of {OUTPUTS}; train it again"
+            )
+        arrays = (*self.weights, *self.biases, self.mean, self.std, self.log_std)
+        if any(array.dtype != np.float32 or not np.isfinite(array).all() for array in arrays) or (self.std <= 0).any():
+            raise DataError(f"behaviour policy {path}: expected finite float32 numbers and std > 0; train it again")
+        width: tuple[int, ...] = self.mean.shape
+        for weight, bias in zip(self.weights, self.biases, strict=True):
+            if len(width) != 1 or weight.shape != (*width, *bias.shape):
+                raise DataError(
+                    f"behaviour policy {path}: a layer of shape {weight.shape} after width {width}, expected "
+                    "(inputs, outputs); train it again"
+                )
+            width = bias.shape
+        if not self.weights or self.log_std.shape != width or self.std.shape != self.mean.shape:
+            raise DataError(f"behaviour policy {path}: the widths of its arrays do not agree; train it again")

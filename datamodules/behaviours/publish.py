@@ -1,0 +1,228 @@
+"""Publish a training: `python -m datamodules.behaviours.publish NAME [--run FOLDER] [--out checkpoints/behaviours]`.
+
+Scores the snapshots, keeps a ladder from random to expert (for the Ant: the last policy), and writes the card, the
+curve and SHA256SUMS.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from datamodules.behaviours.evaluation import RunnerScore, WalkScore, score_runner, score_walker
+from datamodules.behaviours.policy import MLPPolicy
+from datamodules.behaviours.recipes import RECIPES, Recipe, get_recipe
+from dds_lightning.errors import UserError
+from dds_lightning.files import sha256, written_whole
+from dds_lightning.tasks import get_task
+
+NOISES = (0.0, 0.1, 0.2)
+"""Deviations of action noise at which the Ant is scored."""
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One policy of a ladder: its file's name, itself, and its scores without and with exploration."""
+
+    name: str
+    policy: MLPPolicy
+    score: RunnerScore
+    sampled: RunnerScore
+
+
+def snapshots(run: Path) -> list[MLPPolicy]:
+    """All snapshots of a training, oldest first.
+
+    Raises:
+        UserError: There are none.
+    """
+    paths = sorted((run / "snapshots").glob("*.safetensors"))
+    if not paths:
+        raise UserError(f"run: {run} holds no snapshots; train first: python -m datamodules.behaviours.train")
+    return [MLPPolicy.load(path) for path in paths]
+
+
+def choose_rungs(scores: list[float], count: int) -> list[int]:
+    """Indices of at most `count` snapshots whose scores are spread evenly from the first one's to the best one's.
+
+    Args:
+        scores: Of all snapshots, oldest first.
+        count: Rungs, first and best included.
+
+    Returns:
+        Indices with rising scores; the last is the best.
+    """
+    best = int(np.argmax(scores))
+    chosen = {0, best}
+    for target in np.linspace(scores[0], scores[best], count)[1:-1]:
+        chosen.add(int(np.argmin([abs(score - target) for score in scores[: best + 1]])))
+    return sorted(chosen, key=lambda index: scores[index])
+
+
+def ladder(recipe: Recipe, run: Path, *, rungs: int = 9, episodes: int = 20) -> list[Rung]:
+    """Score a runner's snapshots and keep some of them.
+
+    All are scored on a few episodes, the chosen ones again on others: a snapshot that was lucky once does not stay
+    lucky. The three best compete for the last rung.
+    """
+    policies = snapshots(run)
+    first = [score_runner(policy, recipe.name, episodes=5, seed=1_000).score for policy in policies]
+    for index in np.argsort(first)[-3:]:
+        first[index] = score_runner(policies[index], recipe.name, episodes=episodes, seed=2_000).score
+    built = []
+    chosen = choose_rungs(first, rungs)
+    for rank, index in enumerate(chosen):
+        score = score_runner(policies[index], recipe.name, episodes=episodes, seed=3_000)
+        sampled = score_runner(policies[index], recipe.name, episodes=episodes, seed=4_000, sampled=True)
+        name = "000_random" if rank == 0 else "expert" if index == chosen[-1] else f"{10 * rank:03d}"
+        facts = {**policies[index].metadata, "score": score.as_dict(), "score_sampled": sampled.as_dict()}
+        built.append(Rung(name, replace(policies[index], metadata=facts), score, sampled))
+    return built
+
+
+def publish(recipe: Recipe, run: Path, out: Path) -> Path:
+    """Write `out/<behaviour>`; the Ant's two physics share a folder.
+
+    Returns:
+        The folder.
+    """
+    ant = recipe.world.startswith("ant:")
+    folder = out / ("ant" if ant else recipe.name)
+    folder.mkdir(parents=True, exist_ok=True)
+    curve = pd.read_csv(run / "curve.csv")
+    if ant:
+        physics = recipe.world.removeprefix("ant:")
+        policy = snapshots(run)[-1]
+        scores = [score_walker(policy.act, physics, action_noise=noise) for noise in NOISES]
+        facts = {**policy.metadata, "scores": [score.as_dict() for score in scores]}
+        replace(policy, metadata=facts).save(folder / f"{physics}.safetensors")
+        draw_curve(curve, "speed", "m/s along the heading (with all noise)", folder / f"curve-{physics}.png")
+        card = ant_card(folder)
+    else:
+        for path in folder.glob("*.safetensors"):
+            path.unlink()
+        built = ladder(recipe, run)
+        for rung in built:
+            rung.policy.save(folder / f"{rung.name}.safetensors")
+        draw_curve(curve, "return", "return (with exploration)", folder / "curve.png")
+        card = runner_card(recipe, built)
+    with written_whole(folder / "README.md") as part:
+        part.write_text(card, encoding="utf-8")
+    files = sorted(path for path in folder.iterdir() if path.name != "SHA256SUMS" and not path.name.startswith("."))
+    with written_whole(folder / "SHA256SUMS") as part:
+        part.write_text("".join(f"{sha256(path)}  {path.name}\n" for path in files), encoding="utf-8")
+    return folder
+
+
+def draw_curve(curve: pd.DataFrame, column: str, label: str, path: Path) -> None:
+    """A small picture of the training."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(4.2, 2.4), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(curve["steps"] / 1e6, curve[column], color="#0072b2", linewidth=1.2)
+    axes.set_xlabel("environment steps (millions)", fontsize=8)
+    axes.set_ylabel(label, fontsize=8)
+    axes.tick_params(labelsize=7)
+    axes.spines[["top", "right"]].set_visible(False)
+    with written_whole(path) as part:
+        figure.savefig(part, dpi=90, format="png")
+
+
+def _walk_row(score: WalkScore) -> str:
+    return (
+        f"| {score.action_noise:g} | {score.speed:.2f} | {score.upright_speed:.2f} | {score.falls_per_1000:.3f} | "
+        f"{100 * score.on_its_back:.1f} % |"
+    )
+
+
+def ant_card(folder: Path) -> str:
+    """The card of the Ant's controllers, from the facts in their files."""
+    text = """# Ant controllers: they walk where they are told
+
+```python
+from datamodules.behaviours import AntController
+
+controller = AntController("d4rl")  # dds/AntMazeD4RL_*; "robotics" for AntMaze_*-v4, where it is shipped
+actions = controller.act(observations, headings)  # (B, 29), (B,) radians in the world frame -> (B, 8)
+```
+
+Each file is one policy in NumPy (128 x 128 tanh) with its observation statistics; its header says what it was trained
+on and how it scored. Scores: 64 Ants, one episode of 1,000 steps each on an endless floor, without resets; the heading
+is drawn anew, anywhere, every 10 to 80 steps (d4rl; 20 to 160 in robotics' half as long steps). A fall is a tilt of
+more than 90 degrees.
+"""
+    for path in sorted(folder.glob("*.safetensors")):
+        facts = MLPPolicy.load(path).metadata
+        rows = "\n".join(_walk_row(WalkScore(**score)) for score in facts["scores"])
+        text += f"""
+## {path.stem}
+
+| action noise | speed along the heading, m/s | before the first fall | falls per 1,000 steps | on its back at the end |
+| --: | --: | --: | --: | --: |
+{rows}
+
+{facts["algorithm"]}, {facts["steps"]:,} environment steps, {facts["hours"]:.2f} hours of one core:
+`python -m datamodules.behaviours.train {facts["behaviour"]}`, then
+`python -m datamodules.behaviours.publish {facts["behaviour"]}`.
+
+![training curve](curve-{path.stem}.png)
+"""
+    return text
+
+
+def runner_card(recipe: Recipe, built: list[Rung]) -> str:
+    """The card of a runner's ladder."""
+    task = get_task(f"{recipe.name}-medium")
+    rows = "\n".join(
+        f"| {rung.name} | {rung.policy.metadata['steps']:,} | {rung.score.score:.1f} | "
+        f"{rung.score.mean_return:.0f} ± {rung.score.std_return:.0f} | {rung.score.mean_steps:.0f} | "
+        f"{rung.sampled.score:.1f} |"
+        for rung in built
+    )
+    last = built[-1].policy.metadata
+    return f"""# {recipe.name}: a ladder of behaviour policies, random to expert
+
+```python
+from datamodules.behaviours import load_ladder
+
+policies = load_ladder("{recipe.name}")  # name -> policy, rising scores, the last one is "expert"
+actions = policies["expert"].act(observations)  # (B, {task.observation_dim}) -> (B, {task.action_dim})
+```
+
+Scores in {task.env_id}, {built[0].score.episodes} episodes each, normalised as D4RL does ({task.score_min:.0f} is 0,
+{task.score_max:.0f} is 100). "Sampled" draws actions with the noise that the policy had in training
+(`act(observations, rng)`); the other columns take its means.
+
+| file | training steps | score | return | episode length | score, sampled |
+| --- | --: | --: | --: | --: | --: |
+{rows}
+
+PPO, {last["steps"]:,} environment steps up to the expert, {last["hours"]:.2f} hours of one core:
+`python -m datamodules.behaviours.train {recipe.name}`, then `python -m datamodules.behaviours.publish {recipe.name}`.
+`sha256sum -c SHA256SUMS` checks the files.
+
+![training curve](curve.png)
+"""
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("behaviour", choices=RECIPES)
+    parser.add_argument("--run", type=Path, help="the training's folder, by default runs/behaviours/NAME")
+    parser.add_argument("--out", type=Path, default=Path("checkpoints/behaviours"))
+    arguments = parser.parse_args()
+    recipe = get_recipe(arguments.behaviour)
+    try:
+        print(publish(recipe, arguments.run or Path("runs/behaviours") / recipe.name, arguments.out))
+    except UserError as error:
+        parser.exit(2, f"{error}\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,35 @@
+"""Where the trained policies lie."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from datamodules.behaviours.policy import MLPPolicy
+from dds_lightning.errors import UserError
+
+SHIPPED = Path(__file__).resolve().parents[2] / "checkpoints" / "behaviours"
+"""In a checkout of the repository; an installed package does not carry them, so name a folder there."""
+
+
+def load_ladder(behaviour: str, directory: str | Path | None = None) -> dict[str, MLPPolicy]:
+    """A runner's policies from random to expert.
+
+    Args:
+        behaviour: "hopper", "walker2d" or "halfcheetah".
+        directory: The folder of ladders; by default the repository's `checkpoints/behaviours`.
+
+    Returns:
+        Name -> policy with rising scores, "000_random" first and "expert" last; `metadata["score"]` has each one's.
+
+    Raises:
+        UserError: There is no such ladder.
+        DataError: A file is damaged.
+    """
+    folder = Path(directory or SHIPPED) / behaviour
+    paths = sorted(folder.glob("*.safetensors"))
+    if not paths:
+        raise UserError(
+            f"behaviour: {folder} holds no policies; train them with python -m datamodules.behaviours.train and "
+            "publish them, or name another directory"
+        )
+    return {path.stem: MLPPolicy.load(path) for path in paths}
