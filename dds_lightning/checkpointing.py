@@ -49,10 +49,10 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             raise TypeError("storage_options are for remote storage; checkpoints are written to local paths")
         with written_whole(Path(path)) as part:
             torch.save(checkpoint, part)
-            with zipfile.ZipFile(part) as archive:
-                broken = archive.testzip()
-            if broken:
-                raise OSError(f"{path}: '{broken}' reads back differently; the disk may be full or failing")
+            try:
+                _check_sums(part)
+            except zipfile.BadZipFile as error:
+                raise OSError(f"{path} reads back differently ({error}); the disk may be full or failing") from None
 
     def load_checkpoint(
         self,
@@ -79,15 +79,29 @@ def load_ckpt(path: str | os.PathLike[str], map_location: Any = "cpu") -> dict[s
     if not path.is_file():
         raise UserError(f"there is no checkpoint {path}{neighbours(path)}")
     try:
+        _check_sums(path)
         checkpoint = torch.load(path, map_location=map_location, weights_only=True)
     except pickle.UnpicklingError as error:
         reason = str(error).split("\n", 1)[0]
         raise UserError(f"{path} is damaged, or holds more than tensors and plain values: {reason}") from None
-    except (RuntimeError, EOFError, OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+    except (RuntimeError, EOFError, OSError, KeyError, ValueError, NotImplementedError, zipfile.BadZipFile) as error:
         raise UserError(f"{path} is not a readable checkpoint, cut short perhaps: {error}") from None
     if not isinstance(checkpoint, dict) or not isinstance(checkpoint.get("state_dict"), dict):
         raise UserError(f"{path} is not a Lightning checkpoint: it has no state_dict")
     return checkpoint
+
+
+def _check_sums(path: Path) -> None:
+    """Compare every part with its checksum: torch does not, and a changed byte would load as another weight.
+
+    Raises:
+        BadZipFile: a part differs.
+    """
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            broken = archive.testzip()
+        if broken:
+            raise zipfile.BadZipFile(f"'{broken}' was changed since it was written")
 
 
 def load_module(cls: type[M], path: str | os.PathLike[str], part: str) -> M:

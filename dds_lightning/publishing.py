@@ -260,23 +260,31 @@ def build_module(cls: type[M], settings: Mapping[str, Any], state: Mapping[str, 
     # Lightning's command line leaves `_instantiator` and the like, names of code to call: never followed.
     settings = {key: value for key, value in settings.items() if not str(key).startswith("_")}
     try:
-        module = cls(**settings)
+        with torch.device("meta"):  # takes no memory, whatever widths a file may name
+            own = {name: value.shape for name, value in cls(**settings).state_dict().items()}
     except TypeError as error:
         reason = str(error).replace("__init__()", "it").replace(f"{cls.__name__}.", "")
         raise UserError(f"{origin} holds no {cls.__name__} of this version: {reason}") from None
     except UserError as error:
         raise UserError(f"{origin}: {error}") from None
-    own = module.state_dict()
+    except (RuntimeError, ValueError, ArithmeticError, AssertionError) as error:
+        reason = str(error).split("\n", 1)[0]
+        raise UserError(f"{origin} holds settings of which no {cls.__name__} can be built: {reason}") from None
     missing, unknown = sorted(own.keys() - state.keys()), sorted(state.keys() - own.keys())
     if missing or unknown:
         lists = ((what, names) for what, names in (("lacks", missing), ("has unknown", unknown)) if names)
         text = " and ".join(f"{what} {', '.join(names[:3])}{' ...' if names[3:] else ''}" for what, names in lists)
         raise UserError(f"{origin} does not fit {cls.__name__}: it {text}")
     for name, value in state.items():
-        if value.shape != own[name].shape:
-            shapes = f"{tuple(value.shape)}, expected {tuple(own[name].shape)}"
+        if value.shape != own[name]:
+            shapes = f"{tuple(value.shape)}, expected {tuple(own[name])}"
             raise UserError(f"{origin} does not fit {cls.__name__}: {name} is {shapes}")
-        if value.is_floating_point() and bool(torch.isnan(value).any()):
-            raise UserError(f"{origin} holds NaN in {name}: its training diverged; take an earlier checkpoint")
+    module = cls(**settings)
+    learnt = {name for name, _ in module.named_parameters()}
+    for name, value in state.items():
+        bad = ~torch.isfinite(value) if name in learnt else torch.isnan(value)  # a buffer may say "no bound"
+        if bool(bad.any()):
+            found = "NaN" if bool(torch.isnan(value).any()) else "infinity"
+            raise UserError(f"{origin} holds {found} in {name}: its training diverged; take an earlier checkpoint")
     module.load_state_dict(state)
     return module.eval()
