@@ -21,7 +21,8 @@ class WalkRules:
     """What is rewarded and what disturbs; steps are the environment's.
 
     The reward of a step is `speed along the heading - sideways * |speed across it| + alive - effort * |action|^2
-    - level * (1 - cosine of the tilt)` in metres a second. Disturbances are there because mazes have walls and collectors add noise.
+    - level * (1 - cosine of the tilt)`, speeds in metres a second. Disturbances are there because mazes have walls
+    and collectors add noise.
 
     Attributes:
         sideways: See above.

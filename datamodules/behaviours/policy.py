@@ -51,12 +51,15 @@ class MLPPolicy:
     output: str = "clip"
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
-    def act(self, observations: ArrayLike, rng: np.random.Generator | None = None) -> Array:
+    def act(
+        self, observations: ArrayLike, rng: np.random.Generator | None = None, *, noise_scale: float = 1.0
+    ) -> Array:
         """Actions of a batch.
 
         Args:
             observations: (..., O).
             rng: Draws from the policy as it explored in training; without one, its mean is taken.
+            noise_scale: Multiplies the deviation of that exploration.
 
         Returns:
             (..., A) float32 in [-1, 1].
@@ -68,7 +71,7 @@ class MLPPolicy:
             x = np.tanh(x) if self.activation == "tanh" else np.maximum(x, 0.0)
         x = x @ self.weights[-1] + self.biases[-1]
         if rng is not None:
-            x = x + np.exp(self.log_std) * rng.standard_normal(x.shape, dtype=np.float32)
+            x = x + noise_scale * np.exp(self.log_std) * rng.standard_normal(x.shape, dtype=np.float32)
         return np.clip(x, -1.0, 1.0) if self.output == "clip" else np.tanh(x)
 
     def save(self, path: str | Path) -> Path:
@@ -87,6 +90,7 @@ class MLPPolicy:
         }
         with written_whole(Path(path)) as part:
             save_file(tensors, part, metadata=header)
+            part.chmod(0o644)
         return Path(path)
 
     @classmethod
