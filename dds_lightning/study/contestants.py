@@ -104,6 +104,10 @@ def behaviour_controller(task: Task) -> Any:
         from datamodules.collect.antmaze import AntMazeRecipe, AntNavigator
 
         return EveryRow(AntNavigator(task, AntMazeRecipe()))
+    if task.family == "kitchen":
+        from datamodules.collect.kitchen import KitchenDemonstrator, KitchenRecipe
+
+        return EveryRow(KitchenDemonstrator(task, KitchenRecipe()))
     return None
 
 

@@ -6,7 +6,6 @@ import json
 import pickle
 from collections import Counter
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -254,7 +253,6 @@ def test_a_round_does_not_depend_on_what_was_recorded_before() -> None:
 
 
 def test_an_interrupted_collection_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kitchen, "record", partial(kitchen.record, parcel=1))
     recorded: list[int] = []
     interruptions = [2]
 
