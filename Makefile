@@ -5,10 +5,10 @@ SEED   ?= 0
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 # One worker plays a whole file, so that the data and models its tests share are made once.
-PYTEST_ARGS ?= -n auto --dist loadscope
+PYTEST_ARGS ?= -n auto --dist loadscope -m 'not faults'
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format notebooks notebooks-env clean
+.PHONY: help demo test faults lint format notebooks notebooks-env clean
 
 help:  ## show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */\1|/' | awk -F'|' '{printf "  make %-14s %s\n", $$1, $$2}'
@@ -30,6 +30,9 @@ demo: $(VENV)/.installed  ## all stages on PointMaze-Large, about ten minutes on
 
 test: $(VENV)/.installed  ## the test suite
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+faults: $(VENV)/.installed  ## kill every stage at random moments, five minutes
+	$(BIN)/python -m pytest -s tests/faults
 
 lint: $(VENV)/.installed  ## ruff and mypy, changing nothing
 	$(BIN)/ruff check .

@@ -1,12 +1,9 @@
 """Behaviour policies: the NumPy actor, the Ant's frames, the fast learner, and what is shipped."""
 
-import hashlib
-import json
 import subprocess
 import sys
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +12,6 @@ from safetensors.numpy import load_file, save_file
 
 from datamodules.behaviours import AntController, MLPPolicy, load_ladder
 from datamodules.behaviours.ant import ANKLE_SIGN, motor_actions, see
-from datamodules.behaviours.shipped import SHIPPED
 from datamodules.validation import DataError
 from dds_lightning.envs.antmaze import TORQUE, D4RLAntMazeEnv
 from dds_lightning.errors import UserError
@@ -341,48 +337,3 @@ def test_a_resting_ant_neither_moves_nor_falls():
     assert abs(score.speed) < 0.2
     assert score.falls_per_1000 == 0
     assert score.steps == 120
-
-
-# ---------------------------------------------------------------------- what is shipped
-
-
-@pytest.mark.parametrize("folder", sorted(path.name for path in SHIPPED.glob("*") if path.is_dir()))
-def test_shipped_files_are_whole_and_small(folder):
-    lines = (SHIPPED / folder / "SHA256SUMS").read_text(encoding="utf-8").splitlines()
-    sums = dict(reversed(line.split("  ")) for line in lines)
-    files = {path.name: path for path in (SHIPPED / folder).iterdir() if path.name != "SHA256SUMS"}
-    assert set(sums) == set(files)
-    for name, path in files.items():
-        assert hashlib.sha256(path.read_bytes()).hexdigest() == sums[name], name
-    assert sum(path.stat().st_size for path in files.values()) < (1.0e6 if folder == "ant" else 1.5e6)
-    assert "README.md" in files
-
-
-@pytest.mark.parametrize("behaviour", sorted(path.name for path in SHIPPED.glob("*") if path.name != "ant"))
-def test_ladders_rise_from_random_to_expert(behaviour):
-    policies = load_ladder(behaviour)
-    names = list(policies)
-    assert (names[0], names[-1]) == ("000_random", "expert")
-    scores = [policy.metadata["score"]["score"] for policy in policies.values()]
-    assert scores[0] < 10
-    assert scores[-1] == max(scores)
-    assert any(0.3 * scores[-1] < score < 0.55 * scores[-1] for score in scores)  # a medium
-    assert json.dumps(dict(policies["expert"].metadata))
-
-
-def test_the_shipped_ant_walks_where_it_is_told(ant):
-    if not (SHIPPED / "ant" / "d4rl.safetensors").is_file():
-        pytest.skip("no controller is shipped")
-    controller = AntController("d4rl")
-    for heading in np.linspace(-np.pi, np.pi, 5)[:-1] + 0.4:
-        ant.reset(seed=1, options={"noise": False})
-        for _ in range(60):
-            observation = np.concatenate([ant.data.qpos, ant.data.qvel])
-            action = controller.act(observation[None], [heading])[0]
-            ant.step(action)
-        way = ant.data.qpos[:2] @ [np.cos(heading), np.sin(heading)]
-        assert way > 1.5 * 6.0, f"{way:.1f} m in 6 s at heading {heading:.2f}"
-
-
-def test_paths_are_the_repositorys():
-    assert Path(__file__).resolve().parents[2] / "checkpoints" / "behaviours" == SHIPPED

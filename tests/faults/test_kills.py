@@ -1,6 +1,6 @@
 """SIGKILL at random moments of every stage: nothing unloadable, nothing lost, the same bits at the end.
 
-Marked `slow`: about three minutes on two cores. The counts are printed with `pytest -s`.
+Marked `faults`: about five minutes. `make faults` prints the counts.
 """
 
 import json
@@ -17,7 +17,7 @@ from dds_lightning.skill import SkillModule
 from tests.faults.killing import kill_until_finished, launch
 
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.faults,
     pytest.mark.skipif(not hasattr(os, "fork"), reason="kills a forked child"),
 ]
 

@@ -1,0 +1,51 @@
+"""The behaviour policies in checkpoints/behaviours: whole, small, and as good as their cards say."""
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datamodules.behaviours import AntController, load_ladder
+from datamodules.behaviours.shipped import SHIPPED
+from dds_lightning.envs.antmaze import D4RLAntMazeEnv
+
+
+@pytest.mark.parametrize("folder", sorted(path.name for path in SHIPPED.glob("*") if path.is_dir()))
+def test_shipped_files_are_whole_and_small(folder):
+    lines = (SHIPPED / folder / "SHA256SUMS").read_text(encoding="utf-8").splitlines()
+    sums = dict(reversed(line.split("  ")) for line in lines)
+    files = {path.name: path for path in (SHIPPED / folder).iterdir() if path.name != "SHA256SUMS"}
+    assert set(sums) == set(files)
+    for name, path in files.items():
+        assert hashlib.sha256(path.read_bytes()).hexdigest() == sums[name], name
+    assert sum(path.stat().st_size for path in files.values()) < (1.0e6 if folder == "ant" else 1.5e6)
+    assert "README.md" in files
+
+
+@pytest.mark.parametrize("behaviour", sorted(path.name for path in SHIPPED.glob("*") if path.name != "ant"))
+def test_ladders_rise_from_random_to_expert(behaviour):
+    policies = load_ladder(behaviour)
+    names = list(policies)
+    assert (names[0], names[-1]) == ("000_random", "expert")
+    scores = [policy.metadata["score"]["score"] for policy in policies.values()]
+    assert scores[0] < 10
+    assert scores[-1] == max(scores)
+    assert any(0.3 * scores[-1] < score < 0.55 * scores[-1] for score in scores)  # a medium
+
+
+def test_the_shipped_ant_walks_where_it_is_told():
+    ant = D4RLAntMazeEnv(("0",), (0, 0), (0, 0))
+    controller = AntController("d4rl")
+    for heading in np.linspace(-np.pi, np.pi, 5)[:-1] + 0.4:
+        ant.reset(seed=1, options={"noise": False})
+        for _ in range(60):
+            observation = np.concatenate([ant.data.qpos, ant.data.qvel])
+            action = controller.act(observation[None], [heading])[0]
+            ant.step(action)
+        way = ant.data.qpos[:2] @ [np.cos(heading), np.sin(heading)]
+        assert way > 1.5 * 6.0, f"{way:.1f} m in 6 s at heading {heading:.2f}"
+
+
+def test_paths_are_the_repositorys():
+    assert Path(__file__).resolve().parents[2] / "checkpoints" / "behaviours" == SHIPPED
