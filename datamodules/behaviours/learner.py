@@ -27,7 +27,7 @@ def build_world(recipe: Recipe, seed: int) -> World:
 
 
 def build_learner(recipe: Recipe, seed: int) -> FastPPO:
-    """A fresh learner, its environments normalised by running world.obs_rms."""
+    """A fresh learner, its environments normalised by running statistics."""
     world = VecNormalize(
         VecMonitor(build_world(recipe, seed)), gamma=recipe.settings["gamma"], clip_obs=OBSERVATION_CLIP
     )

@@ -17,14 +17,21 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
-from stable_baselines3.common.callbacks import BaseCallback
+
+from dds_lightning.errors import UserError
+
+try:
+    from stable_baselines3.common.callbacks import BaseCallback
+except ImportError as missing:
+    raise UserError(
+        "training a behaviour needs stable-baselines3: pip install 'dds-lightning[behaviours]'"
+    ) from missing
 
 from datamodules.behaviours.ant_world import AntWorld
 from datamodules.behaviours.fast_ppo import FastPPO
 from datamodules.behaviours.learner import build_learner, export_policy, load_state, save_state
 from datamodules.behaviours.recipes import RECIPES, Recipe, get_recipe
 from datamodules.behaviours.worlds import World
-from dds_lightning.errors import UserError
 from dds_lightning.training.interrupts import caught, deferred, pending
 
 COLUMNS = ("steps", "hours", "return", "episode_steps", "speed", "falls_per_1000", "exploration", "steps_per_second")
@@ -44,6 +51,7 @@ class Bookkeeper(BaseCallback):
         self.world: World = world
         self.integrator = world.model.opt.integrator
         self.next_row = self.next_snapshot = self.next_state = 0
+        self.spacing = max(recipe.steps // recipe.rungs, 1)
         self.last = (time.process_time(), 0)
 
     @property
@@ -55,15 +63,14 @@ class Bookkeeper(BaseCallback):
         steps = self.num_timesteps
         self.last = (time.process_time(), steps)
         self.next_row, self.next_state = steps + self.every, steps + 5 * self.every
-        spacing = max(self.recipe.steps // self.recipe.rungs, 1)
-        self.next_snapshot = -(-steps // spacing) * spacing
+        self.next_snapshot = -(-steps // self.spacing) * self.spacing
 
     def _on_rollout_start(self) -> None:
         coarse = self.num_timesteps < self.recipe.coarse_steps
         self.world.model.opt.integrator = EULER if coarse else self.integrator
         if self.num_timesteps >= self.next_snapshot:
             self.snapshot()
-            self.next_snapshot += max(self.recipe.steps // self.recipe.rungs, 1)
+            self.next_snapshot += self.spacing
         if self.num_timesteps >= self.next_row:
             self.row()
             self.next_row += self.every

@@ -303,7 +303,8 @@ class KitchenController:
 
     def _enter(self, index: int) -> None:
         """Begin a move of the subtask, or the end of its moves."""
-        self._index, self._count, self._gap = index, 0, None
+        self._index, self._count = index, 0
+        self._gap: Vector | None = None
         self._best, self._best_count = 0.0, 0
         move = self._script.moves[index] if index < len(self._script.moves) else None
         if isinstance(move, Reach):  # what follows keeps the error with which the handle was met
