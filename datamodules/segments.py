@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from datamodules.collect.collectors import COLLECTORS
+from datamodules.collect.collectors import can_collect
 from datamodules.sources import load_trajectories, resolve_task
 from datamodules.trajectories import Trajectories, Windows
 from dds_lightning.errors import UserError
@@ -286,7 +286,7 @@ class SegmentDataModule(pl.LightningDataModule):
     def _how_to_get_data(self) -> str:
         if self.task is None:
             return "data: neither a task nor data were given; give at least data, for example local:DIR"
-        if self.task.family not in COLLECTORS:
+        if not can_collect(self.task):
             return f"data: none was given for task '{self.task.name}'; give d4rl:FILE or minari:ID"
         collected = f"`dds data collect {self.task.name} --out data`"
         place = f"local:data/{self.task.data_ids.get('local', self.task.name)}"

@@ -16,13 +16,18 @@ COLLECTORS = {
 """Family and physics -> module and name of a function `(task, steps, seed, out, workers, *, dataset_id, overwrite)`."""
 
 
+def can_collect(task: Task) -> bool:
+    """Whether there is a collector for the task's family and physics."""
+    return (task.family, task.physics) in COLLECTORS
+
+
 def refuse_uncollectable(task: Task) -> None:
     """Say where data come from for a task that cannot be collected.
 
     Raises:
         UserError: There is no collector for the task's family and physics.
     """
-    if (task.family, task.physics) not in COLLECTORS:
+    if not can_collect(task):
         known = ", ".join(f"{family}-...{f'@{physics}' if physics else ''}" for family, physics in COLLECTORS)
         raise UserError(
             f"data: nothing collects data for task '{task.name}' yet, only for {known}: give --data "
