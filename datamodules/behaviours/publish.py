@@ -70,18 +70,19 @@ def ladder(recipe: Recipe, run: Path, *, rungs: int = 9, episodes: int = 20) -> 
     lucky. The three best compete for the last rung.
     """
     policies = snapshots(run)
-    first = [score_runner(policy, recipe.name, episodes=5, seed=1_000).score for policy in policies]
+    first = [score_runner(policy, recipe.name, episodes=10, seed=1_000).score for policy in policies]
     for index in np.argsort(first)[-3:]:
         first[index] = score_runner(policies[index], recipe.name, episodes=episodes, seed=2_000).score
-    built = []
-    chosen = choose_rungs(first, rungs)
-    for rank, index in enumerate(chosen):
+    scored = []
+    for index in choose_rungs(first, rungs):
         score = score_runner(policies[index], recipe.name, episodes=episodes, seed=3_000)
         sampled = score_runner(policies[index], recipe.name, episodes=episodes, seed=4_000, sampled=True)
-        name = "000_random" if rank == 0 else "expert" if index == chosen[-1] else f"{10 * rank:03d}"
         facts = {**policies[index].metadata, "score": score.as_dict(), "score_sampled": sampled.as_dict()}
-        built.append(Rung(name, replace(policies[index], metadata=facts), score, sampled))
-    return built
+        scored.append(Rung("", replace(policies[index], metadata=facts), score, sampled))
+    start, *others = scored
+    others.sort(key=lambda rung: rung.score.score)
+    names = ["000_random", *(f"{10 * rank:03d}" for rank in range(1, len(others))), "expert"]
+    return [replace(rung, name=name) for rung, name in zip([start, *others], names, strict=True)]
 
 
 def publish(recipe: Recipe, run: Path, out: Path) -> Path:

@@ -11,6 +11,7 @@ from dds_lightning.tasks import Task, get_task
 COLLECTORS = {
     ("pointmaze", ""): ("datamodules.collect.pointmaze", "collect_pointmaze"),
     ("antmaze", "d4rl"): ("datamodules.collect.antmaze", "collect_antmaze"),
+    ("locomotion", "v4"): ("datamodules.collect.locomotion", "collect_locomotion"),
     ("kitchen", ""): ("datamodules.collect.kitchen", "collect_kitchen"),
 }
 """Family and physics -> module and name of a function `(task, steps, seed, out, workers, *, dataset_id, overwrite)`."""
