@@ -7,8 +7,9 @@ from pathlib import Path
 from datamodules.behaviours.policy import MLPPolicy
 from dds_lightning.errors import UserError
 
-SHIPPED = Path(__file__).resolve().parents[2] / "checkpoints" / "behaviours"
-"""In a checkout of the repository; an installed package does not carry them, so name a folder there."""
+_PACKAGED = Path(__file__).resolve().parent / "shipped_policies"
+SHIPPED = _PACKAGED if _PACKAGED.is_dir() else Path(__file__).resolve().parents[2] / "checkpoints" / "behaviours"
+"""The folder of the shipped policies: inside an installed package, or in a checkout of the repository."""
 
 
 def load_ladder(behaviour: str, directory: str | Path | None = None) -> dict[str, MLPPolicy]:
