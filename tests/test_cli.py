@@ -156,7 +156,7 @@ def test_every_command_explains_itself(dds, words):
         (["data", "check", "nowhere"], ["nowhere"]),
         (["data", "check", "nowhere.hdf5"], ["nowhere.hdf5", "d4rl:FILE"]),
         (["data", "collect", "nope"], ["nope"]),
-        (["data", "collect", "kitchen-mixed"], ["kitchen-mixed", "pointmaze", "dds data fetch kitchen-mixed"]),
+        (["data", "collect", "hopper-medium@v5"], ["hopper-medium@v5", "pointmaze", "dds data fetch hopper-medium"]),
         (["data", "fetch", "nope"], ["nope"]),
         (["data", "fetch", TASK], [TASK, "d4rl", "minari:"]),
         (["data", "fetch", TASK, "--source", "here"], ["here", "dds data fetch --help"]),

@@ -89,9 +89,7 @@ def test_gumbel_noise_samples_from_the_policy_at_its_temperature(exported):
     count = 4000
     observation = np.tile(np.array([0.5, 1.0, 2.0, -3.0], np.float32), (count, 1))
     gumbel = np.random.default_rng(1).gumbel(size=(count, K)).astype(np.float32)
-    _, codes = call(
-        observation, np.full(count, -1), gumbel, np.zeros((agent.skill.draws, count, 2), np.float32)
-    )
+    _, codes = call(observation, np.full(count, -1), gumbel, np.zeros((agent.skill.draws, count, 2), np.float32))
     with torch.inference_mode():
         expected = (agent.policy.logits(torch.from_numpy(observation[:1])) / agent.temperature).softmax(-1)[0].numpy()
     np.testing.assert_allclose(np.bincount(codes, minlength=K) / count, expected, atol=4 * np.sqrt(0.25 / count))

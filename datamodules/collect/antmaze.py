@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from importlib import metadata as installed
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.behaviours.ant import SHIPPED, AntController
-from datamodules.collect.minari_writer import write_minari
-from datamodules.collect.recording import Episode, Kept, record
+from datamodules.collect.collecting import place, record_set
+from datamodules.collect.recording import Episode
 from datamodules.collect.waypoints import Waypoints
-from datamodules.storage import refuse_existing
 from dds_lightning.envs.build import build_env
 from dds_lightning.errors import UserError
 from dds_lightning.files import sha256
@@ -97,42 +95,21 @@ def collect_antmaze(
     recipe = recipe or AntMazeRecipe()
     if task.family != "antmaze" or task.physics != "d4rl":
         raise UserError(f"task: '{task.name}' is no AntMaze in D4RL's physics, and this collector knows only those")
-    if steps < 1:
-        raise UserError(f"steps: found {steps}, expected at least 1")
-    if seed < 0:
-        raise UserError(f"seed: found {seed}, expected at least 0")
-    name = dataset_id or task.data_ids["local"]
-    folder = Path(out) / name
-    refuse_existing(folder, overwrite)
+    folder = place(task, steps, seed, out, dataset_id, overwrite)
     recorder = _Recorder(task, seed, steps, recipe)
-    made_from = {
-        "task": task.name,
-        "seed": seed,
-        "steps": steps,
-        **asdict(recipe),
-        "controller": sha256(SHIPPED / "ant" / f"{task.physics}.safetensors"),
-    }
-    kept = Kept(folder, made_from)
-    env = recorder.env()
-    assert env.spec is not None, "made by its id"
-    write_minari(
-        out,
-        name,
-        record(recorder, workers, parcel=1, kept=kept, title=f"collecting {name}" if progress else None),
-        env_spec=env.spec,
+    controller = sha256(SHIPPED / "ant" / f"{task.physics}.safetensors")
+    return record_set(
+        folder,
+        recorder,
+        recorder.env(),
+        {"task": task.name, "seed": seed, "steps": steps, **asdict(recipe), "controller": controller},
         observation_space=gym.spaces.Box(-np.inf, np.inf, (task.observation_dim,), np.float32),
-        action_space=env.action_space,
+        algorithm="shortest path over cells, heading-conditioned Ant controller",
+        description=_description(task, seed, recipe),
+        workers=workers,
         overwrite=overwrite,
-        metadata={
-            "author": ["dds-lightning"],
-            "algorithm_name": "shortest path over cells, heading-conditioned Ant controller",
-            "description": _description(task, seed, recipe),
-            "requirements": [f"{p}=={installed.version(p)}" for p in ("gymnasium", "mujoco")],
-            "collection": made_from,
-        },
+        progress=progress,
     )
-    kept.remove()
-    return folder
 
 
 class _Recorder:

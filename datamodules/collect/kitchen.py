@@ -7,7 +7,6 @@ import itertools
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
-from importlib import metadata as installed
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +14,9 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from datamodules.collect.collecting import place, record_set
 from datamodules.collect.kitchen_moves import SCRIPTS, KitchenController
-from datamodules.collect.minari_writer import write_minari
-from datamodules.collect.recording import Episode, Kept, record
-from datamodules.storage import refuse_existing
+from datamodules.collect.recording import Episode
 from dds_lightning.envs.build import build_env
 from dds_lightning.envs.kitchen import SUBTASKS, kitchen_layout
 from dds_lightning.errors import UserError
@@ -123,44 +121,23 @@ def collect_kitchen(
     recipe = recipe or KitchenRecipe()
     if task.family != "kitchen":
         raise UserError(f"task: '{task.name}' is no kitchen task, and this collector makes data only for those")
-    if steps < 1:
-        raise UserError(f"steps: found {steps}, expected at least 1")
-    if seed < 0:
-        raise UserError(f"seed: found {seed}, expected at least 0")
-    name = dataset_id or task.data_ids["local"]
-    folder = Path(out) / name
-    refuse_existing(folder, overwrite)
+    folder = place(task, steps, seed, out, dataset_id, overwrite)
     recorder = _Recorder(task, seed, steps, recipe)
-    made_from = {
-        "task": task.name,
-        "seed": seed,
-        "steps": steps,
-        **asdict(recipe),
-        "moves": hashlib.sha256(repr(SCRIPTS).encode()).hexdigest()[:16],
-    }
-    kept = Kept(folder, made_from)
-    kept.open()
     env, _ = recorder.kitchen()
-    title = f"collecting {name}" if progress else None
-    assert env.spec is not None, "made by its id"
-    write_minari(
-        out,
-        name,
-        _until(record(recorder, workers, parcel=1, kept=kept, title=title), steps),
-        env_spec=env.spec,
+    moves = hashlib.sha256(repr(SCRIPTS).encode()).hexdigest()[:16]
+    return record_set(
+        folder,
+        recorder,
+        env,
+        {"task": task.name, "seed": seed, "steps": steps, **asdict(recipe), "moves": moves},
         observation_space=env.observation_space,
-        action_space=env.action_space,
+        algorithm="scripted moves of the hand, damped least-squares inverse kinematics",
+        description=_description(task, seed, recipe),
+        workers=workers,
         overwrite=overwrite,
-        metadata={
-            "author": ["dds-lightning"],
-            "algorithm_name": "scripted moves of the hand, damped least-squares inverse kinematics",
-            "description": _description(task, seed, recipe),
-            "requirements": [f"{p}=={installed.version(p)}" for p in ("gymnasium-robotics", "mujoco")],
-            "collection": made_from,
-        },
+        progress=progress,
+        shorten=lambda episodes: _until(episodes, steps),
     )
-    kept.remove()
-    return folder
 
 
 def _until(episodes: Iterable[Episode], steps: int) -> Iterator[Episode]:

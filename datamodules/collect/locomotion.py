@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from importlib import metadata as installed
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +22,8 @@ from numpy.typing import NDArray
 
 from datamodules.behaviours.policy import MLPPolicy
 from datamodules.behaviours.shipped import load_ladder
-from datamodules.collect.minari_writer import write_minari
-from datamodules.collect.recording import Episode, Kept, record
-from datamodules.storage import refuse_existing
+from datamodules.collect.collecting import place, record_set
+from datamodules.collect.recording import Episode
 from dds_lightning.envs.build import build_env
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import Task, get_task
@@ -96,40 +94,24 @@ def collect_locomotion(
     recipe = recipe or LocomotionRecipe()
     if task.family != "locomotion":
         raise UserError(f"task: '{task.name}' is no locomotion task, and this collector knows only those")
-    if steps < 1:
-        raise UserError(f"steps: found {steps}, expected at least 1")
-    if seed < 0:
-        raise UserError(f"seed: found {seed}, expected at least 0")
+    folder = place(task, steps, seed, out, dataset_id, overwrite)
     body, _, quality = task.base_name.partition("-")
     chosen = mixture(ladder or load_ladder(body), quality)
-    name = dataset_id or task.data_ids["local"]
-    folder = Path(out) / name
-    refuse_existing(folder, overwrite)
     recorder = _Recorder(task, seed, steps, recipe, tuple(chosen.values()))
     behaviours = {rung: dict(policy.metadata) for rung, policy in chosen.items()}
-    made_from = {"task": task.name, "seed": seed, "steps": steps, **asdict(recipe), "behaviours": behaviours}
-    kept = Kept(folder, made_from)
-    env = recorder.env()
-    assert env.spec is not None, "made by its id"
-    write_minari(
-        out,
-        name,
-        record(recorder, workers, parcel=1, kept=kept, title=f"collecting {name}" if progress else None),
-        env_spec=env.spec,
+    noise = f"with action noise {recipe.action_noise}"
+    return record_set(
+        folder,
+        recorder,
+        recorder.env(),
+        {"task": task.name, "seed": seed, "steps": steps, **asdict(recipe), "behaviours": behaviours},
         observation_space=gym.spaces.Box(-np.inf, np.inf, (task.observation_dim,), np.float32),
-        action_space=env.action_space,
+        algorithm=f"PPO, {', '.join(chosen)}",
+        description=f"{body} run by {len(chosen)} behaviour(s) {noise}. Seed {seed}.",
+        workers=workers,
         overwrite=overwrite,
-        metadata={
-            "author": ["dds-lightning"],
-            "algorithm_name": f"PPO, {', '.join(chosen)}",
-            "description": f"{body} run by {len(chosen)} behaviour(s) with action noise {recipe.action_noise}. "
-            f"Seed {seed}.",
-            "requirements": [f"{p}=={installed.version(p)}" for p in ("gymnasium", "mujoco")],
-            "collection": made_from,
-        },
+        progress=progress,
     )
-    kept.remove()
-    return folder
 
 
 def mixture(ladder: Mapping[str, MLPPolicy], quality: str) -> dict[str, MLPPolicy]:
