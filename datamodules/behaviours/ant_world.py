@@ -167,7 +167,7 @@ class AntWorld(World):
         noise = self.noise[:, None] * rng.standard_normal((self.num_envs, 8))
         controls = motor_actions(np.clip(self.actions + noise, -1.0, 1.0), self.turns) * self.force
         before = self.qpos[:, :2].copy()
-        kicked = rng.random(self.num_envs) < rules.kick_probability
+        kicked = np.asarray(rng.random(self.num_envs) < rules.kick_probability)
         for i, data in enumerate(self.data):
             data.ctrl[:] = controls[i]
             mujoco.mj_step(self.model, data, nstep=self.frame_skip)

@@ -90,7 +90,8 @@ class FastPPO(PPO):
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         rate = self.policy.optimizer.param_groups[0]["lr"]
-        clip = self.clip_range(self._current_progress_remaining)  # type: ignore[operator]
+        clip_range: Any = self.clip_range  # a schedule, once the model is set up
+        clip = clip_range(self._current_progress_remaining)
         numbers, (first, second) = self.numbers, self.moments
         rollout = next(self.rollout_buffer.get())  # all rows, already shuffled
         columns = [

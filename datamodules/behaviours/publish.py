@@ -85,8 +85,14 @@ def ladder(recipe: Recipe, run: Path, *, rungs: int = 9, episodes: int = 20) -> 
     return [replace(rung, name=name) for rung, name in zip([start, *others], names, strict=True)]
 
 
-def publish(recipe: Recipe, run: Path, out: Path) -> Path:
+def publish(recipe: Recipe, run: Path, out: Path, note: str = "") -> Path:
     """Write `out/<behaviour>`; the Ant's two physics share a folder.
+
+    Args:
+        recipe: What was trained.
+        run: The training's folder.
+        out: Where the folder goes.
+        note: One more sentence for the card, such as where this training departed from the recipe.
 
     Returns:
         The folder.
@@ -99,9 +105,9 @@ def publish(recipe: Recipe, run: Path, out: Path) -> Path:
         physics = recipe.world.removeprefix("ant:")
         policy = snapshots(run)[-1]
         scores = [score_walker(policy.act, physics, action_noise=noise) for noise in NOISES]
-        facts = {**policy.metadata, "scores": [score.as_dict() for score in scores]}
+        facts = {**policy.metadata, "scores": [score.as_dict() for score in scores], "note": note}
         replace(policy, metadata=facts).save(folder / f"{physics}.safetensors")
-        draw_curve(curve, "speed", "m/s along the heading (with all noise)", folder / f"curve-{physics}.png")
+        draw_curve(curve, "speed", "speed, with all noise (m/s)", folder / f"curve-{physics}.png")
         card = ant_card(folder)
     else:
         for path in folder.glob("*.safetensors"):
@@ -110,13 +116,18 @@ def publish(recipe: Recipe, run: Path, out: Path) -> Path:
         for rung in built:
             rung.policy.save(folder / f"{rung.name}.safetensors")
         draw_curve(curve, "return", "return (with exploration)", folder / "curve.png")
-        card = runner_card(recipe, built)
+        card = runner_card(recipe, built, note)
     with written_whole(folder / "README.md") as part:
         part.write_text(card, encoding="utf-8")
+    write_sums(folder)
+    return folder
+
+
+def write_sums(folder: Path) -> None:
+    """SHA256SUMS of all other files."""
     files = sorted(path for path in folder.iterdir() if path.name != "SHA256SUMS" and not path.name.startswith("."))
     with written_whole(folder / "SHA256SUMS") as part:
         part.write_text("".join(f"{sha256(path)}  {path.name}\n" for path in files), encoding="utf-8")
-    return folder
 
 
 def draw_curve(curve: pd.DataFrame, column: str, label: str, path: Path) -> None:
@@ -169,14 +180,14 @@ more than 90 degrees.
 
 {facts["algorithm"]}, {facts["steps"]:,} environment steps, {facts["hours"]:.2f} hours of one core:
 `python -m datamodules.behaviours.train {facts["behaviour"]}`, then
-`python -m datamodules.behaviours.publish {facts["behaviour"]}`.
+`python -m datamodules.behaviours.publish {facts["behaviour"]}`. {facts["note"]}
 
 ![training curve](curve-{path.stem}.png)
 """
     return text
 
 
-def runner_card(recipe: Recipe, built: list[Rung]) -> str:
+def runner_card(recipe: Recipe, built: list[Rung], note: str) -> str:
     """The card of a runner's ladder."""
     task = get_task(f"{recipe.name}-medium")
     rows = "\n".join(
@@ -205,7 +216,7 @@ Scores in {task.env_id}, {built[0].score.episodes} episodes each, normalised as 
 
 PPO, {last["steps"]:,} environment steps up to the expert, {last["hours"]:.2f} hours of one core:
 `python -m datamodules.behaviours.train {recipe.name}`, then `python -m datamodules.behaviours.publish {recipe.name}`.
-`sha256sum -c SHA256SUMS` checks the files.
+`sha256sum -c SHA256SUMS` checks the files. {note}
 
 ![training curve](curve.png)
 """
@@ -217,10 +228,11 @@ def main() -> None:
     parser.add_argument("behaviour", choices=RECIPES)
     parser.add_argument("--run", type=Path, help="the training's folder, by default runs/behaviours/NAME")
     parser.add_argument("--out", type=Path, default=Path("checkpoints/behaviours"))
+    parser.add_argument("--note", default="", help="one more sentence for the card")
     arguments = parser.parse_args()
     recipe = get_recipe(arguments.behaviour)
     try:
-        print(publish(recipe, arguments.run or Path("runs/behaviours") / recipe.name, arguments.out))
+        print(publish(recipe, arguments.run or Path("runs/behaviours") / recipe.name, arguments.out, arguments.note))
     except UserError as error:
         parser.exit(2, f"{error}\n")
 

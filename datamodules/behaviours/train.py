@@ -44,7 +44,8 @@ class Bookkeeper(BaseCallback):
     def __init__(self, recipe: Recipe, learner: FastPPO, out: Path, hours: float, every: int = 50_000) -> None:
         super().__init__()
         self.learner: Any = learner
-        world: Any = learner.env.unwrapped  # type: ignore[union-attr]
+        env: Any = learner.env
+        world: Any = env.unwrapped
         self.recipe, self.out, self.every = recipe, out, every
         self.hours_before, self.began = hours, time.process_time()
         self.falls, self.speeds = 0, 0.0
