@@ -180,7 +180,7 @@ more than 90 degrees.
 
 {facts["algorithm"]}, {facts["steps"]:,} environment steps, {facts["hours"]:.2f} hours of one core:
 `python -m datamodules.behaviours.train {facts["behaviour"]}`, then
-`python -m datamodules.behaviours.publish {facts["behaviour"]}`. {facts["note"]}
+`python -m datamodules.behaviours.publish {facts["behaviour"]}`.{" " + facts["note"] if facts["note"] else ""}
 
 ![training curve](curve-{path.stem}.png)
 """
@@ -216,7 +216,7 @@ Scores in {task.env_id}, {built[0].score.episodes} episodes each, normalised as 
 
 PPO, {last["steps"]:,} environment steps up to the expert, {last["hours"]:.2f} hours of one core:
 `python -m datamodules.behaviours.train {recipe.name}`, then `python -m datamodules.behaviours.publish {recipe.name}`.
-`sha256sum -c SHA256SUMS` checks the files. {note}
+`sha256sum -c SHA256SUMS` checks the files.{" " + note if note else ""}
 
 ![training curve](curve.png)
 """

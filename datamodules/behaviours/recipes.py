@@ -46,7 +46,7 @@ def _ant(name: str, physics: str) -> Recipe:
     return Recipe(
         name=name,
         world=f"ant:{physics}",
-        steps=3_600_000,
+        steps=4_600_000,
         environments=64,
         hidden=(128, 128),
         settings={
@@ -59,7 +59,7 @@ def _ant(name: str, physics: str) -> Recipe:
             "vf_coef": 0.5,
         },
         policy_settings={"log_std_init": -0.7},
-        coarse_steps=2_800_000,
+        coarse_steps=4_000_000,
     )
 
 
