@@ -43,6 +43,8 @@ class PolicyModule(StageModule):
         fourier_features: frequencies given to value, Q and policy networks beside the observation; 0 for none. They
             let a small network see a thin wall early (named departure from the paper).
         fourier_scale: standard deviation of those frequencies.
+        fourier_seen: how many leading numbers of the observation they see; 0 for all. 2 on a robot with many joints
+            whose position comes first, lest a moving leg hide where it is.
         tau: expectile of the value loss.
         alpha: temperature of AWR; larger follows the critic more closely. One preset with the rewards' scale.
         weight_clip: upper bound of the AWR weights.
@@ -67,7 +69,7 @@ class PolicyModule(StageModule):
 
     STAGE = "policy"
     PARTS: ClassVar = {"critic": ("value", "critic", "target_critic"), "actor": ("actor",)}
-    SHAPE = ("num_skills", "hidden_dims", "layer_norm", "fourier_features", "fourier_scale")
+    SHAPE = ("num_skills", "hidden_dims", "layer_norm", "fourier_features", "fourier_scale", "fourier_seen")
     OF_DATA = ("support_mask", "value_range")
     support_mask: Tensor
     value_range: Tensor
@@ -80,6 +82,7 @@ class PolicyModule(StageModule):
         layer_norm: bool = False,
         fourier_features: int = 0,
         fourier_scale: float = 1.0,
+        fourier_seen: int = 0,
         tau: float = 0.7,
         alpha: float = 3.0,
         weight_clip: float = 100.0,
@@ -105,7 +108,7 @@ class PolicyModule(StageModule):
         self.features: nn.Module = nn.Identity()
         width = observation_dim
         if fourier_features:
-            self.features = FourierFeatures(observation_dim, fourier_features, fourier_scale)
+            self.features = FourierFeatures(observation_dim, fourier_features, fourier_scale, fourier_seen)
             width = self.features.output_dim
         self.value = MLP(width, 1, hidden_dims, layer_norm)
         self.critic = MLP(width, num_skills, hidden_dims, layer_norm, members=2)
@@ -123,6 +126,7 @@ class PolicyModule(StageModule):
         h = self.hparams
         rules = [
             ("num_skills", h.num_skills >= 2, "at least 2: with one code there is nothing to choose"),
+            ("fourier_seen", 0 <= h.fourier_seen <= h.observation_dim, f"in [0, {h.observation_dim}]"),
             ("tau", 0 < h.tau < 1, "in (0, 1)"),
             ("alpha", h.alpha >= 0, "0 or more"),
             ("weight_clip", h.weight_clip > 0, "positive"),

@@ -243,6 +243,7 @@ def test_the_watch_warns_of_values_that_no_rewards_can_sum_to():
         ({"alpha": -1.0}, "model.alpha is -1.0"),
         ({"target_ema": 0.0}, "model.target_ema is 0.0"),
         ({"support": 0.5}, "model.support is 0.5"),
+        ({"fourier_seen": 3}, r"model.fourier_seen is 3, expected in \[0, 2\]"),
     ],
 )
 def test_settings_out_of_range_are_refused_by_name(settings, message):
@@ -256,3 +257,12 @@ def test_fourier_features_and_layer_norm_keep_the_shapes():
     assert module.v(states).shape == (3,)
     assert module.q(states).shape == (3, 4)
     assert module.logits(states).shape == (3, 4)
+
+
+def test_fourier_features_may_see_the_position_alone():
+    module = small(fourier_features=8, fourier_seen=1)
+    here, elsewhere = torch.tensor([[0.5, 1.0]]), torch.tensor([[0.5, -1.0]])
+    width = 2
+    assert torch.equal(module.embed(here)[:, width:], module.embed(elsewhere)[:, width:])
+    assert not torch.equal(module.embed(here), module.embed(elsewhere))
+    assert module.features.output_dim == width + 16

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import importlib
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import Task, get_task
 
 COLLECTORS = {
-    ("pointmaze", ""): ("datamodules.collect.pointmaze", "collect_pointmaze"),
-    ("antmaze", "d4rl"): ("datamodules.collect.antmaze", "collect_antmaze"),
-    ("locomotion", "v4"): ("datamodules.collect.locomotion", "collect_locomotion"),
-    ("kitchen", ""): ("datamodules.collect.kitchen", "collect_kitchen"),
+    ("pointmaze", ""): ("datamodules.collect.pointmaze", "collect_pointmaze", None),
+    ("antmaze", "d4rl"): ("datamodules.collect.antmaze", "collect_antmaze", "AntMazeRecipe"),
+    ("locomotion", "v4"): ("datamodules.collect.locomotion", "collect_locomotion", "LocomotionRecipe"),
+    ("kitchen", ""): ("datamodules.collect.kitchen", "collect_kitchen", "KitchenRecipe"),
 }
-"""Family and physics -> module and name of a function `(task, steps, seed, out, workers, *, dataset_id, overwrite)`."""
+"""Family and physics -> module, function `(task, steps, seed, out, workers, *, dataset_id, overwrite)`, and the class
+of its `recipe`; None where what a recipe would hold are the function's own keywords."""
 
 
 def can_collect(task: Task) -> bool:
@@ -43,6 +48,7 @@ def collect(
     out: str | Path = "data",
     workers: int | None = None,
     *,
+    recipe: Mapping[str, Any] | None = None,
     dataset_id: str | None = None,
     overwrite: bool = False,
 ) -> Path:
@@ -54,6 +60,7 @@ def collect(
         seed: The same seed gives the same bytes of every array.
         out: Folder of data sets.
         workers: Processes; None takes every core.
+        recipe: What the behaviour shall do otherwise than by default, for example `{"action_noise": 0.1}`.
         dataset_id: Name of the set; None takes the task's own.
         overwrite: Replace a set of the same name.
 
@@ -65,6 +72,28 @@ def collect(
     """
     task = get_task(task) if isinstance(task, str) else task
     refuse_uncollectable(task)
-    module, name = COLLECTORS[task.family, task.physics]
-    collector = getattr(importlib.import_module(module), name)
-    return collector(task, steps, seed, out, workers, dataset_id=dataset_id, overwrite=overwrite)
+    module_name, name, recipe_class = COLLECTORS[task.family, task.physics]
+    module = importlib.import_module(module_name)
+    collector: Callable[..., Path] = getattr(module, name)
+    options = _options(task, collector, getattr(module, recipe_class) if recipe_class else None, recipe or {})
+    return collector(task, steps, seed, out, workers, **options, dataset_id=dataset_id, overwrite=overwrite)
+
+
+def _options(
+    task: Task, collector: Callable[..., Path], recipe_class: Any, recipe: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The collector's keywords that stand for a recipe."""
+    if not recipe:
+        return {}
+    if recipe_class:
+        known = [field.name for field in fields(recipe_class)]
+    else:
+        every = inspect.signature(collector).parameters.values()
+        about_the_set = ("dataset_id", "overwrite", "progress")
+        known = [p.name for p in every if p.kind is p.KEYWORD_ONLY and p.name not in about_the_set]
+    for name, value in recipe.items():
+        if name not in known:
+            raise UserError(f"recipe.{name}: '{task.name}' has no such setting; it has {', '.join(known)}")
+        if not isinstance(value, bool | int | float):
+            raise UserError(f"recipe.{name}: found {value!r}, expected a number, true or false")
+    return {"recipe": recipe_class(**recipe)} if recipe_class else dict(recipe)

@@ -119,8 +119,11 @@ def collect(
     out: str = "data",
     workers: int | None = None,
     overwrite: bool = False,
+    recipe: dict[str, bool | int | float] | None = None,
 ) -> Report:
     """Make a data set by driving the task's environment, on all cores.
+
+    Call it again after an interruption and it goes on where it stopped (PointMaze, which takes seconds, begins anew).
 
     Args:
         task: name of a task; `dds tasks` lists them
@@ -129,10 +132,12 @@ def collect(
         out: folder of data sets; the new one is a folder in it
         workers: processes; without it one for every core
         overwrite: replace a data set of the same name
+        recipe: what the behaviour does, one flag a setting, such as --recipe.action_noise=0.1 or, for AntMaze,
+            --recipe.end_when_flipped=true; a name that is not known is answered with those that are
     """
     from datamodules.collect.collectors import collect as collect_data
 
-    path = collect_data(task, steps, seed, out, workers, overwrite=overwrite)
+    path = collect_data(task, steps, seed, out, workers, recipe=recipe, overwrite=overwrite)
     return Report(
         {"task": task, "data": f"local:{path}", "path": path, "steps": steps, "seed": seed},
         [f"{steps:,} steps of {task} in {path}; use them as local:{path}"],

@@ -31,18 +31,19 @@ class FourierFeatures(nn.Module):
         input_dim: width of the input.
         features: number of frequencies F; the output has input_dim + 2 F dimensions.
         scale: standard deviation of the frequencies, in cycles per unit of normalised input times 2 pi.
+        seen: how many leading numbers of the input the frequencies see; 0 for all of them.
     """
 
     frequencies: Tensor
 
-    def __init__(self, input_dim: int, features: int, scale: float) -> None:
+    def __init__(self, input_dim: int, features: int, scale: float, seen: int = 0) -> None:
         super().__init__()
-        self.register_buffer("frequencies", scale * torch.randn(input_dim, features))
+        self.register_buffer("frequencies", scale * torch.randn(seen or input_dim, features))
         self.output_dim = input_dim + 2 * features
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (..., I) to (..., I + 2 F)."""
-        phase = x @ self.frequencies
+        phase = x[..., : len(self.frequencies)] @ self.frequencies
         return torch.cat([x, phase.sin(), phase.cos()], dim=-1)
 
 

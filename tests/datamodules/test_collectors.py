@@ -16,8 +16,8 @@ from dds_lightning.tasks import get_task, task_names
 def test_each_family_has_a_collector_that_can_be_imported_or_says_where_data_come_from(monkeypatch):
     import importlib
 
-    for module, name in COLLECTORS.values():
-        assert callable(getattr(importlib.import_module(module), name))
+    for module, *names in COLLECTORS.values():
+        assert all(callable(getattr(importlib.import_module(module), name)) for name in names if name)
     monkeypatch.setattr("datamodules.collect.collectors.COLLECTORS", {})
     for name in task_names():
         with pytest.raises(UserError, match=rf"'{name}'.*d4rl:FILE.*minari:ID.*dds data fetch {name}"):
@@ -35,6 +35,38 @@ def test_collecting_goes_to_the_collector_of_the_family(monkeypatch):
     given, options = collect(task.name, 100, 3, "out", 2, dataset_id="mine")
     assert given == (task, 100, 3, "out", 2)
     assert options == {"dataset_id": "mine", "overwrite": False}
+
+
+def test_a_recipe_says_what_the_behaviour_does(monkeypatch):
+    import datamodules.collect.antmaze as ants
+    import datamodules.collect.pointmaze as points
+
+    monkeypatch.setattr(ants, "collect_antmaze", lambda *given, **options: options)
+    options = collect("antmaze-umaze", 100, recipe={"action_noise": 0.1, "end_when_flipped": True})
+    assert options["recipe"] == ants.AntMazeRecipe(action_noise=0.1, end_when_flipped=True)
+    called = {}
+
+    def collector(*given, speed=4.5, dataset_id=None, overwrite=False):
+        called.update(speed=speed)
+
+    monkeypatch.setattr(points, "collect_pointmaze", collector)
+    collect("pointmaze-umaze-play", 100, recipe={"speed": 3})
+    assert called == {"speed": 3}
+
+
+@pytest.mark.parametrize(
+    ("task", "recipe", "message"),
+    [
+        ("antmaze-umaze", {"noise": 0.1}, r"recipe.noise: 'antmaze-umaze' has no such setting; it has action_noise, "),
+        ("antmaze-umaze", {"action_noise": -1}, "action_noise: found -1, expected"),
+        ("hopper-medium", {"action_noise": "much"}, "recipe.action_noise: found 'much', expected a number"),
+        ("pointmaze-umaze-play", {"overwrite": True}, "recipe.overwrite: .* has no such setting; it has episode_steps"),
+    ],
+)
+def test_a_recipe_that_is_none_is_refused(task, recipe, message, tmp_path):
+    with pytest.raises(UserError, match=message):
+        collect(task, 100, out=tmp_path, recipe=recipe)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_signature_changes_with_names_sizes_and_times(tmp_path, monkeypatch):
