@@ -15,11 +15,12 @@ import pytest
 import torch
 
 from dds_lightning import DDSAgent
+from dds_lightning.actors import EveryRow
 from dds_lightning.cli import main
 from dds_lightning.errors import UserError
 from dds_lightning.run_settings import RunSettings, Trainings
 from dds_lightning.study import report
-from dds_lightning.study.contestants import EveryRow, final_table, way_name
+from dds_lightning.study.contestants import final_table, way_name
 from dds_lightning.tasks import get_task
 
 TASK = "pointmaze-umaze-diverse"

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from datamodules.behaviours.policy import MLPPolicy
@@ -156,3 +157,43 @@ def score_walker(
         on_its_back=float(1.0 - standing.mean()),
         steps=ants * steps,
     )
+
+
+def score_navigator(noises: tuple[float, ...], *, episodes: int = 100, seed: int = 0) -> pd.DataFrame:
+    """Let the shipped Ant controller walk from the start to the evaluation's goal, in each of D4RL's mazes.
+
+    Args:
+        noises: Deviations of Gaussian noise on the actions.
+        episodes: Of each maze and noise.
+        seed: Of goals, starts and noise.
+
+    Returns:
+        A row a maze and noise: `maze`, `action_noise`, `episodes`, `reached`, `median_steps` (of those that reached
+        the goal), `cap` (steps after which an episode is over).
+    """
+    from datamodules.collect.antmaze import AntMazeRecipe, AntNavigator
+    from dds_lightning.actors import Contestant, EveryRow
+    from dds_lightning.rollout import rollout
+
+    rows = []
+    for maze in ("umaze", "medium", "large"):
+        task = get_task("antmaze-umaze" if maze == "umaze" else f"antmaze-{maze}-diverse")
+        players = [
+            Contestant(f"{noise:g}", EveryRow(AntNavigator(task, AntMazeRecipe(action_noise=noise))), episodes)
+            for noise in noises
+        ]
+        played = rollout(task, players, seed=seed).episodes
+        for player, noise in zip(players, noises, strict=True):
+            own = played[played["actor"] == player.name]
+            there = own[own["success"].astype(bool)]
+            rows.append(
+                {
+                    "maze": maze,
+                    "action_noise": noise,
+                    "episodes": episodes,
+                    "reached": len(there),
+                    "median_steps": float(there["length"].median()),
+                    "cap": task.max_episode_steps,
+                }
+            )
+    return pd.DataFrame(rows)

@@ -1,7 +1,8 @@
 """Publish a training: `python -m datamodules.behaviours.publish NAME [--run FOLDER] [--out checkpoints/behaviours]`.
 
 Scores the snapshots, keeps a ladder from random to expert (for the Ant: the last policy), and writes the card, the
-curve and SHA256SUMS.
+curve and SHA256SUMS. `publish ant --mazes 100` instead lets the shipped Ant walk to the goals of D4RL's mazes, 100
+episodes each, and adds the table to its card.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from datamodules.behaviours.evaluation import RunnerScore, WalkScore, score_runner, score_walker
+from datamodules.behaviours.evaluation import RunnerScore, WalkScore, score_navigator, score_runner, score_walker
 from datamodules.behaviours.policy import MLPPolicy
 from datamodules.behaviours.recipes import RECIPES, Recipe, get_recipe
 from dds_lightning.errors import UserError
@@ -22,6 +23,8 @@ from dds_lightning.tasks import get_task
 
 NOISES = (0.0, 0.1, 0.2)
 """Deviations of action noise at which the Ant is scored."""
+MAZES = "mazes-d4rl.csv"
+"""How the Ant did in mazes, beside its policies."""
 
 
 @dataclass(frozen=True)
@@ -184,7 +187,49 @@ more than 90 degrees.
 
 ![training curve](curve-{path.stem}.png)
 """
-    return text
+    mazes = folder / MAZES
+    return text + (maze_table(pd.read_csv(mazes)) if mazes.is_file() else "")
+
+
+def maze_table(walks: pd.DataFrame) -> str:
+    """The card's section on mazes, from the rows of `score_navigator`."""
+    rows = "\n".join(
+        f"| {row.maze} | {row.action_noise:g} | {100 * row.reached / row.episodes:.0f} % | {row.median_steps:.0f} | "
+        f"{row.cap} |"
+        for row in walks.itertuples(index=False)
+    )
+    return f"""
+## From the start to the goal of D4RL's mazes
+
+A planner over cells tells it where to walk (`AntNavigator`); {walks["episodes"].min()} episodes each, steps of those
+that reach the goal: `python -m datamodules.behaviours.publish ant --mazes {walks["episodes"].min()}`.
+
+| maze | action noise | reached | median steps | time-out |
+| --- | --: | --: | --: | --: |
+{rows}
+"""
+
+
+def publish_mazes(episodes: int, out: Path) -> Path:
+    """Let the shipped Ant controller walk through D4RL's mazes and add the table to its card.
+
+    Args:
+        episodes: Of each maze and noise.
+        out: Where the folder `ant` is.
+
+    Returns:
+        The folder.
+    """
+    folder = out / "ant"
+    if not (folder / "d4rl.safetensors").is_file():
+        raise UserError(f"out: {folder} holds no controller for D4RL's physics; publish one first, without --mazes")
+    walks = score_navigator(NOISES, episodes=episodes)
+    with written_whole(folder / MAZES) as part:
+        walks.to_csv(part, index=False)
+    with written_whole(folder / "README.md") as part:
+        part.write_text(ant_card(folder), encoding="utf-8")
+    write_sums(folder)
+    return folder
 
 
 def runner_card(recipe: Recipe, built: list[Rung], note: str) -> str:
@@ -229,9 +274,15 @@ def main() -> None:
     parser.add_argument("--run", type=Path, help="the training's folder, by default runs/behaviours/NAME")
     parser.add_argument("--out", type=Path, default=Path("checkpoints/behaviours"))
     parser.add_argument("--note", default="", help="one more sentence for the card")
+    parser.add_argument("--mazes", type=int, metavar="EPISODES", help="only play the shipped Ant in D4RL's mazes")
     arguments = parser.parse_args()
+    if arguments.mazes is not None and (arguments.mazes < 1 or arguments.behaviour != "ant"):
+        parser.error("--mazes is for the ant, and takes a number of episodes of at least 1")
     recipe = get_recipe(arguments.behaviour)
     try:
+        if arguments.mazes is not None:
+            print(publish_mazes(arguments.mazes, arguments.out))
+            return
         print(publish(recipe, arguments.run or Path("runs/behaviours") / recipe.name, arguments.out, arguments.note))
     except UserError as error:
         parser.exit(2, f"{error}\n")

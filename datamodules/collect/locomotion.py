@@ -208,3 +208,35 @@ class _Run:
             "terminations": last & terminated,
             "truncations": last & (not terminated),
         }
+
+
+class Runners:
+    """The behaviours of a data set as an actor: environment e is played by behaviour e modulo their number.
+
+    `codes` is None: this actor chooses no skills.
+    """
+
+    def __init__(
+        self, task: Task | str, recipe: LocomotionRecipe | None = None, ladder: Mapping[str, MLPPolicy] | None = None
+    ) -> None:
+        """Prepare for `task`; the arguments are those of `collect_locomotion`."""
+        task = get_task(task) if isinstance(task, str) else task
+        self.recipe = recipe or LocomotionRecipe()
+        body, _, quality = task.base_name.partition("-")
+        self.policies = tuple(mixture(ladder or load_ladder(body), quality).values())
+        self.codes: NDArray[np.int64] | None = None
+        self.reset()
+
+    def reset(self, num_envs: int = 1, seed: int | None = None) -> None:
+        """Prepare for `num_envs` environments; `seed` fixes the noise."""
+        del num_envs
+        self._rng = np.random.default_rng(seed)
+
+    def act(self, observations: NDArray[np.float32], restarted: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
+        """Actions (E, A) in the box for observations (E, O)."""
+        del restarted
+        owners = np.arange(len(observations)) % len(self.policies)
+        proposed = np.stack([policy.act(observations) for policy in self.policies])  # (policies, E, A)
+        actions = proposed[owners, np.arange(len(observations))]
+        noise = self.recipe.action_noise * self._rng.standard_normal(actions.shape)
+        return np.clip(actions + noise, -1.0, 1.0).astype(np.float32)

@@ -11,7 +11,7 @@ import pytest
 
 from datamodules import load_trajectories
 from datamodules.behaviours.policy import MLPPolicy
-from datamodules.collect.locomotion import LocomotionRecipe, collect_locomotion, mixture
+from datamodules.collect.locomotion import LocomotionRecipe, Runners, collect_locomotion, mixture
 from datamodules.replay import replay_check
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import get_task
@@ -117,3 +117,15 @@ def test_settings_out_of_range_are_refused(options: dict[str, Any], message: str
 def test_recipes_out_of_range_are_refused(setting: dict[str, Any]) -> None:
     with pytest.raises(UserError, match=f"{next(iter(setting))}: found"):
         LocomotionRecipe(**setting)
+
+
+def test_the_behaviours_play_again_each_in_its_own_environments() -> None:
+    quiet, noisy = LocomotionRecipe(action_noise=0.0), LocomotionRecipe(action_noise=0.1)
+    actions = Runners("hopper-medium-expert", quiet, ladder()).act(np.zeros((4, 11), np.float32))
+    assert np.allclose(actions, np.array([0.4, 0.8, 0.4, 0.8])[:, None])
+    runners, again = (Runners("hopper-medium", noisy, ladder()) for _ in range(2))
+    runners.reset(2, seed=3)
+    again.reset(2, seed=3)
+    first = runners.act(np.zeros((2, 11), np.float32))
+    assert np.array_equal(first, again.act(np.zeros((2, 11), np.float32)))
+    assert 0 < np.abs(first - 0.4).max() < 0.5

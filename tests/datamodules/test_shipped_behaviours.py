@@ -1,14 +1,18 @@
 """The behaviour policies in checkpoints/behaviours: whole, small, and as good as their cards say."""
 
 import hashlib
+import shutil
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from datamodules.behaviours import AntController, load_ladder
+from datamodules.behaviours.publish import MAZES, NOISES, publish_mazes
 from datamodules.behaviours.shipped import SHIPPED
 from dds_lightning.envs.antmaze import D4RLAntMazeEnv
+from dds_lightning.errors import UserError
 
 
 @pytest.mark.parametrize("folder", sorted(path.name for path in SHIPPED.glob("*") if path.is_dir()))
@@ -49,3 +53,17 @@ def test_the_shipped_ant_walks_where_it_is_told():
 
 def test_paths_are_the_repositorys():
     assert Path(__file__).resolve().parents[2] / "checkpoints" / "behaviours" == SHIPPED
+
+
+def test_the_shipped_ant_walks_to_the_goals_of_mazes_and_its_card_tells(tmp_path):
+    shutil.copytree(SHIPPED / "ant", tmp_path / "ant")
+    folder = publish_mazes(1, tmp_path)
+    walks = pd.read_csv(folder / MAZES)
+    assert walks["maze"].tolist() == [maze for maze in ("umaze", "medium", "large") for _ in NOISES]
+    assert walks["cap"].tolist() == [700] * 3 + [1000] * 6
+    assert walks["reached"].sum() >= 7, walks
+    median = walks.loc[0, "median_steps"]
+    assert f"| umaze | 0 | 100 % | {median:.0f} | 700 |" in (folder / "README.md").read_text()
+    assert MAZES in (folder / "SHA256SUMS").read_text()
+    with pytest.raises(UserError, match="holds no controller"):
+        publish_mazes(1, tmp_path / "elsewhere")
