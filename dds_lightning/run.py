@@ -9,7 +9,6 @@ The two trainings are the very commands `dds skill fit` and `dds policy fit`, wh
 """
 
 import json
-import shlex
 from pathlib import Path
 from typing import Any
 
@@ -132,6 +131,8 @@ class Run:
             "selection": w.selection,
             "temperature": w.temperature,
         }
+        if w.noise_scale is not None:
+            settings["noise_scale"] = w.noise_scale
         title = f"evaluate: {self.episodes} episodes each, in the real environment"
         reads = [self.skill, self.policy, self.clone]
         self.evaluated = stages.do("evaluate", title, settings, reads, self._evaluate)
@@ -227,7 +228,7 @@ class Run:
 
         def agent_of(checkpoint: str) -> DDSAgent:
             policy = PolicyModule.load(self.policy.outputs[checkpoint])
-            return DDSAgent(skill, policy, w.selection, w.temperature, seed=w.seed)  # type: ignore[arg-type]
+            return DDSAgent(skill, policy, w.selection, w.temperature, w.noise_scale, seed=w.seed)  # type: ignore[arg-type]
 
         agent = agent_of("checkpoint")
         best = agent_of("best") if chosen else None
@@ -263,15 +264,13 @@ class Run:
 
         w = self.wanted
         made = f"collected by `dds data collect {self.task.name} --steps {w.data_steps} --seed {w.seed}`"
-        words = ["dds", "run", self.task.name, f"--seed={w.seed}", *(["--data", w.data] if w.data else [])]
-        words += [f"--{stage}.{word.removeprefix('--')}" for stage in ("skill", "policy") for word in getattr(w, stage)]
         return agent_card(
             self.task,
             episodes,
             seed=w.seed,
             data={"source": w.data or made, **self.data_facts},
             settings=self.trainings.settings,
-            command=shlex.join(words),
+            command=w.command(),
         )
 
     def _write_report(self, folder: Path, resuming: bool) -> dict[str, Any]:

@@ -1,13 +1,14 @@
 """What `dds run` was asked to do, and what that means for its two trainings: their words and their settings."""
 
 import json
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dds_lightning.configs import find_preset
+from dds_lightning.configs import RUN_DEFAULTS, find_preset, run_defaults
 from dds_lightning.errors import UserError
-from dds_lightning.tasks import Task
+from dds_lightning.tasks import Task, get_task
 
 WATCH_EPISODES = 10
 """Episodes of each evaluation while the policy trains."""
@@ -23,18 +24,49 @@ class RunSettings:
     data: str | None = None
     seed: int = 0
     preset: str | None = None
-    data_steps: int = 200_000
-    clone_steps: int = 4000
+    data_steps: int = RUN_DEFAULTS["data_steps"]
+    clone_steps: int = RUN_DEFAULTS["clone_steps"]
     evaluate_every: int | None = None
     episodes: int | None = None
     episodes_per_skill: int = 20
-    selection: str = "sample"
-    temperature: float = 1.0
+    selection: str = RUN_DEFAULTS["selection"]
+    temperature: float = RUN_DEFAULTS["temperature"]
+    noise_scale: float | None = RUN_DEFAULTS["noise_scale"]
     workers: int | None = None
     until: str = "report"
     fresh: bool = False
     skill: tuple[str, ...] = ()
     policy: tuple[str, ...] = ()
+
+    @classmethod
+    def with_preset(cls, task: str, out: Path, preset: str | None = None, **asked: Any) -> "RunSettings":
+        """Settings in which the preset fills in what is None and `run_defaults` knows.
+
+        Args:
+            task: name of a task.
+            out: folder of the run.
+            preset: as in `dds run`; None takes the task family's.
+            **asked: the other settings.
+
+        Raises:
+            UserError: there is no such task or preset, or the preset's `run.yaml` holds something else.
+        """
+        defaults = run_defaults(preset or get_task(task).family)
+        missing = {name: value for name, value in defaults.items() if asked.get(name) is None}
+        return cls(task=task, out=out, preset=preset, **{**asked, **missing})
+
+    def command(self) -> str:
+        """The command line that makes the same run again, `--out` aside."""
+        usual = RunSettings.with_preset(self.task, self.out, self.preset)
+        words = ["dds", "run", self.task, f"--seed={self.seed}"]
+        for name in ("data", "preset", *RUN_DEFAULTS, "evaluate_every", "episodes", "episodes_per_skill"):
+            value = getattr(self, name)
+            if value != getattr(usual, name) or (name == "preset" and value):
+                words.append(f"--{name}={value}")
+        words += [
+            f"--{stage}.{word.removeprefix('--')}" for stage in ("skill", "policy") for word in getattr(self, stage)
+        ]
+        return shlex.join(words)
 
 
 class Trainings:

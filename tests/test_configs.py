@@ -1,10 +1,21 @@
 """Every packaged configuration parses against the real signatures, and the paper's hold its tables."""
 
+from pathlib import Path
+
 import pytest
 import yaml
 
-from dds_lightning.configs import ROOT, find, find_preset, packaged, resolve_configs
+from dds_lightning.configs import (
+    ROOT,
+    RUN_DEFAULTS,
+    find,
+    find_preset,
+    packaged,
+    resolve_configs,
+    run_defaults,
+)
 from dds_lightning.errors import UserError
+from dds_lightning.run_settings import RunSettings
 from dds_lightning.tasks import get_task, task_names
 from dds_lightning.training.fitting import settings_of
 
@@ -78,3 +89,39 @@ def test_an_unknown_configuration_or_preset_lists_the_packaged_ones(tmp_path):
         find_preset("nope")
     with pytest.raises(UserError, match=r"has no skill.yaml"):
         find_preset(str(tmp_path))
+
+
+def test_a_presets_run_fills_in_what_was_not_asked_for(tmp_path):
+    for stage, path in find_preset("pointmaze").items():
+        (tmp_path / f"{stage}.yaml").write_text(path.read_text())
+    assert run_defaults(str(tmp_path)) == RUN_DEFAULTS
+    (tmp_path / "run.yaml").write_text("data_steps: 1000\ntemperature: 1\nselection: greedy\n")
+    wanted = RunSettings.with_preset("hopper-medium", Path("out"), str(tmp_path), selection=None, temperature=0.5)
+    assert (wanted.data_steps, wanted.selection, wanted.temperature, wanted.clone_steps) == (1000, "greedy", 0.5, 4000)
+    for family in ("antmaze", "kitchen", "locomotion", "paper", "pointmaze"):
+        assert run_defaults(family)["data_steps"] >= 100_000
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("steps: 3", "run.yaml sets steps, expected only data_steps, clone_steps, selection, temperature"),
+        ("data_steps: many", "run.yaml sets data_steps to 'many', expected a value like 200000"),
+        ("- 3", "run.yaml holds no settings"),
+    ],
+)
+def test_a_presets_run_that_is_none_is_refused(tmp_path, text, message):
+    (tmp_path / "run.yaml").write_text(text)
+    with pytest.raises(UserError, match=message):
+        run_defaults(str(tmp_path))
+
+
+def test_a_run_tells_the_command_that_makes_it_again():
+    plain = RunSettings.with_preset("hopper-medium", Path("out"))
+    assert plain.command() == "dds run hopper-medium --seed=0"
+    asked = RunSettings.with_preset(
+        "hopper-medium", Path("out"), seed=3, data_steps=5000, noise_scale=0.5, policy=("--model.alpha=10",)
+    )
+    assert asked.command() == (
+        "dds run hopper-medium --seed=3 --data_steps=5000 --noise_scale=0.5 --policy.model.alpha=10"
+    )

@@ -2,15 +2,26 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+
+import yaml
 
 from dds_lightning.errors import UserError
 
 ROOT = Path(__file__).parent
+RUN_DEFAULTS: dict[str, Any] = {
+    "data_steps": 200_000,
+    "clone_steps": 4000,
+    "selection": "sample",
+    "temperature": 1.0,
+    "noise_scale": None,  # the skill model's own
+}
+"""What a preset's `run.yaml` may set, and what holds without it."""
 
 
 def packaged() -> list[str]:
     """Names of all packaged configurations, as `--config` takes them."""
-    return sorted(str(path.relative_to(ROOT)) for path in ROOT.rglob("*.yaml"))
+    return sorted(str(path.relative_to(ROOT)) for path in ROOT.rglob("*.yaml") if path.name != "run.yaml")
 
 
 def find(name: str) -> Path:
@@ -31,15 +42,47 @@ def find_preset(name: str) -> dict[str, Path]:
     Raises:
         UserError: neither exists, or one of the two files is missing.
     """
-    folder = Path(name) if Path(name).is_dir() else ROOT / name
-    if not folder.is_dir():
-        known = ", ".join(sorted({Path(entry).parent.name for entry in packaged()}))
-        raise UserError(f"preset: there is no folder {name}, and the packaged ones are {known}")
+    folder = _preset_folder(name)
     pair = {stage: folder / f"{stage}.yaml" for stage in ("skill", "policy")}
     for path in pair.values():
         if not path.is_file():
             raise UserError(f"preset: folder {folder} has no {path.name}")
     return pair
+
+
+def run_defaults(name: str) -> dict[str, Any]:
+    """What a preset says about `dds run` beside its two trainings; the file `run.yaml` may be missing.
+
+    Args:
+        name: as for `find_preset`.
+
+    Returns:
+        A value for each of `RUN_DEFAULTS`.
+
+    Raises:
+        UserError: there is no such preset, or its `run.yaml` holds something else.
+    """
+    path = _preset_folder(name) / "run.yaml"
+    chosen = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    known = ", ".join(RUN_DEFAULTS)
+    if not isinstance(chosen, dict):
+        raise UserError(f"preset: {path} holds no settings, expected some of {known}")
+    for key, value in chosen.items():
+        if key not in RUN_DEFAULTS:
+            raise UserError(f"preset: {path} sets {key}, expected only {known}")
+        likeness = 1.0 if RUN_DEFAULTS[key] is None else RUN_DEFAULTS[key]
+        kinds = (int, float) if isinstance(likeness, float) else type(likeness)
+        if not isinstance(value, kinds) or isinstance(value, bool):
+            raise UserError(f"preset: {path} sets {key} to {value!r}, expected a value like {likeness!r}")
+    return {**RUN_DEFAULTS, **chosen}
+
+
+def _preset_folder(name: str) -> Path:
+    folder = Path(name) if Path(name).is_dir() else ROOT / name
+    if not folder.is_dir():
+        known = ", ".join(sorted({Path(entry).parent.name for entry in packaged()}))
+        raise UserError(f"preset: there is no folder {name}, and the packaged ones are {known}")
+    return folder
 
 
 def resolve_configs(words: Sequence[str]) -> list[str]:

@@ -23,6 +23,7 @@ def evaluate(
     episodes: int | None = None,
     selection: Sequence[str] = ("greedy", "sample"),
     temperature: float = 1.0,
+    noise_scale: float | None = None,
     checkpoint: Literal["last", "best", "both"] = "both",
     seed: int = 0,
     workers: int | None = None,
@@ -46,7 +47,7 @@ def evaluate(
     shown: dict[str, str] = {}
     facts: dict[str, Any] | None = None
     for kind, place in places.items():
-        agent = _agent(place, wanted, seed)
+        agent = _agent(place, wanted, seed, noise_scale)
         if kind == BEST:
             facts = load_published(place).config["checkpoint"]
         for choice in dict.fromkeys(selection):
@@ -88,8 +89,9 @@ def _places(directory: Path, checkpoint: str) -> dict[str, Path]:
     return {checkpoint: found[checkpoint]}
 
 
-def _agent(path: Path, task: Task, seed: int) -> DDSAgent:
-    agent = DDSAgent.load(path, seed=seed)
+def _agent(path: Path, task: Task, seed: int, noise_scale: float | None) -> DDSAgent:
+    chosen = {} if noise_scale is None else {"noise_scale": noise_scale}
+    agent = DDSAgent.load(path, seed=seed, **chosen)
     found, expected = (agent.observation_dim, agent.action_dim), (task.observation_dim, task.action_dim)
     if found != expected:
         raise UserError(
