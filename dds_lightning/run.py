@@ -260,15 +260,20 @@ class Run:
 
     def _card(self, episodes: Any) -> str:
         """The README.md of the published agent."""
+        from datamodules.collect.collectors import collection_command
         from dds_lightning.study.card import agent_card
 
         w = self.wanted
-        made = f"collected by `dds data collect {self.task.name} --steps {w.data_steps} --seed {w.seed}`"
+        command = f"dds data collect {self.task.name} --steps {w.data_steps} --seed {w.seed}"
+        source = f"collected by `{command}`"
+        if w.data is not None:
+            known = collection_command(w.data.removeprefix("local:")) if w.data.startswith("local:") else None
+            source = f"collected by `{known}` ({w.data})" if known else w.data
         return agent_card(
             self.task,
             episodes,
             seed=w.seed,
-            data={"source": w.data or made, **self.data_facts},
+            data={"source": source, **self.data_facts},
             settings=self.trainings.settings,
             command=w.command(),
         )

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import json
+import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -97,3 +99,24 @@ def _options(
         if not isinstance(value, bool | int | float):
             raise UserError(f"recipe.{name}: found {value!r}, expected a number, true or false")
     return {"recipe": recipe_class(**recipe)} if recipe_class else dict(recipe)
+
+
+def collection_command(folder: str | Path) -> str | None:
+    """The command that makes a collected data set again, as its metadata tell; None for a set made otherwise.
+
+    Args:
+        folder: Of the data set, as in `local:FOLDER`.
+    """
+    try:
+        told = json.loads((Path(folder) / "data" / "metadata.json").read_text(encoding="utf-8"))["collection"]
+        task, steps, seed = get_task(told["task"]), int(told["steps"]), int(told["seed"])
+        module, _, recipe_class = COLLECTORS[task.family, task.physics]
+    except (OSError, ValueError, KeyError, TypeError, UserError):
+        return None
+    words = ["dds", "data", "collect", task.name, f"--steps={steps}", f"--seed={seed}"]
+    if recipe_class:
+        for field in fields(getattr(importlib.import_module(module), recipe_class)):
+            value = told.get(field.name, field.default)
+            if value != field.default and isinstance(value, bool | int | float):
+                words.append(f"--recipe.{field.name}={value}")
+    return shlex.join(words)

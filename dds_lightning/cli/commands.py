@@ -20,13 +20,14 @@ def run(
     data: str | None = None,
     seed: int = 0,
     preset: str | None = None,
-    data_steps: int = 200_000,
-    clone_steps: int = 4000,
+    data_steps: int | None = None,
+    clone_steps: int | None = None,
     evaluate_every: int | None = None,
     episodes: int | None = None,
     episodes_per_skill: int = 20,
-    selection: Literal["sample", "greedy", "argmax_q"] = "sample",
-    temperature: float = 1.0,
+    selection: Literal["sample", "greedy", "argmax_q"] | None = None,
+    temperature: float | None = None,
+    noise_scale: float | None = None,
     workers: int | None = None,
     until: Literal["data", "skill", "relabel", "policy", "clone", "evaluate", "report"] = "report",
     fresh: bool = False,
@@ -54,9 +55,10 @@ def run(
         out: folder of the run; without it runs/TASK
         data: your data, local:DIR, minari:ID, d4rl:FILE or arrays:DIR; without it data are collected in the environment
         seed: of everything random: data, both trainings and the evaluation
-        preset: packaged pair of configurations (antmaze, kitchen, locomotion, pointmaze, paper), or a folder with
-            skill.yaml and policy.yaml; without it the task family's
-        data_steps: environment steps to collect
+        preset: packaged configurations (antmaze, kitchen, locomotion, pointmaze, paper), or a folder with skill.yaml,
+            policy.yaml and, if you like, run.yaml (data_steps, clone_steps, selection, temperature, noise_scale);
+            without it the task family's
+        data_steps: environment steps to collect; without it the preset's, as for clone_steps, selection, temperature
         clone_steps: optimiser steps of the behaviour-cloning baseline
         evaluate_every: steps between two evaluations of 10 episodes while the policy trains; the best checkpoint by
             their score is told beside the last; 0 for none; without it a quarter of the training, on PointMaze none
@@ -64,6 +66,7 @@ def run(
         episodes_per_skill: evaluation episodes of each single skill alone
         selection: how the published agent chooses skills; the table shows every way
         temperature: of `sample`; below 1 is nearer to greedy
+        noise_scale: factor on the decoder's noise when acting; without it the preset's, or the skill model's own
         workers: processes for environments; without it one for every core
         until: the last stage to do
         fresh: do every stage again
@@ -73,7 +76,7 @@ def run(
     from dds_lightning.run import RunSettings, run_all
 
     return run_all(
-        RunSettings(
+        RunSettings.with_preset(
             task=task,
             out=Path(out or f"runs/{task}"),
             data=data_spec(data) if data else None,
@@ -86,6 +89,7 @@ def run(
             episodes_per_skill=episodes_per_skill,
             selection=selection,
             temperature=temperature,
+            noise_scale=noise_scale,
             workers=workers,
             until=until,
             fresh=fresh,
@@ -150,6 +154,7 @@ def evaluate(
     episodes: int | None = None,
     selection: list[str] = ["greedy", "sample"],  # noqa: B006
     temperature: float = 1.0,
+    noise_scale: float | None = None,
     checkpoint: Literal["last", "best", "both"] = "both",
     seed: int = 0,
     workers: int | None = None,
@@ -173,6 +178,7 @@ def evaluate(
         episodes: episodes for each way of choosing skills; without it the task's own number
         selection: how skills are chosen: greedy, sample, argmax_q, random; several give one row each
         temperature: of `sample`; below 1 is nearer to greedy
+        noise_scale: factor on the decoder's noise; without it the agent's own
         checkpoint: which of a run's checkpoints; both means the last and, where the run kept one, the best
         seed: of the environments and of sampling
         workers: processes for environments; without it one for every core
@@ -186,6 +192,7 @@ def evaluate(
         episodes=episodes,
         selection=selection,
         temperature=temperature,
+        noise_scale=noise_scale,
         checkpoint=checkpoint,
         seed=seed,
         workers=workers,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from datamodules.collect.collectors import COLLECTORS, collect, refuse_uncollectable
+from datamodules.collect.collectors import COLLECTORS, collect, collection_command, refuse_uncollectable
 from datamodules.signature import locate, signature
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import get_task, task_names
@@ -94,3 +94,14 @@ def test_what_is_not_there_is_said_in_one_sentence(spec):
     with pytest.raises(UserError, match=r"nothing at|missing"):
         signature(spec)
     assert list(Path().iterdir()) == []
+
+
+def test_a_collected_set_tells_the_command_that_makes_it_again(tmp_path):
+    recipe = {"action_noise": 0.06}
+    folder = collect("hopper-medium", 40, seed=3, out=tmp_path, workers=1, recipe=recipe)
+    assert collection_command(folder) == (
+        "dds data collect hopper-medium --steps=40 --seed=3 --recipe.action_noise=0.06"
+    )
+    (folder / "data" / "metadata.json").write_text('{"collection": {"task": "mine"}}')
+    assert collection_command(folder) is None
+    assert collection_command(tmp_path) is None
