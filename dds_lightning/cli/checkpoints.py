@@ -20,8 +20,8 @@ def publish(
 ) -> Report:
     """Make a directory of an agent that others can load and trust, or push it to the Hugging Face hub.
 
-    The directory holds the weights (safetensors), settings, scores, a card and the hashes of all files; nothing in
-    it is ever run. It is verified before it takes its place.
+    The directory holds the weights (safetensors), settings, scores, a card (a run's says which stage loses) and the
+    hashes of all files; nothing in it is ever run. It is verified before it takes its place.
 
     Args:
         run: a run of `dds run` or a directory that is published already; "-" with --skill
@@ -35,6 +35,7 @@ def publish(
     from dds_lightning.agent import DDSAgent
     from dds_lightning.hub import is_hub, push
     from dds_lightning.publishing import CARD, load_published
+    from dds_lightning.study.card import with_diagnosis
     from dds_lightning.study.contestants import agent_directory
     from dds_lightning.tasks import get_task
     from dds_lightning.verification import verify_published
@@ -58,7 +59,10 @@ def publish(
         published = load_published(source)
         agent = DDSAgent.load(source)
         about, metrics = {"task": task or published.config.get("task")}, dict(published.metrics)
-        text = (source / CARD).read_text(encoding="utf-8") if text is None else text
+        if text is None:
+            text = (source / CARD).read_text(encoding="utf-8")
+            if (Path(run) / "report").is_dir():
+                text = with_diagnosis(text, Path(run))
     if is_hub(place):
         import tempfile
 

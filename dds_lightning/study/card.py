@@ -2,11 +2,14 @@
 
 import textwrap
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from dds_lightning.study.page import headline
+from dds_lightning.study.diagnosis import diagnose
+from dds_lightning.study.findings import Findings
+from dds_lightning.study.page import diagnosis_section, headline
 from dds_lightning.study.protocol import paper_line
 from dds_lightning.study.tables import CONTESTANT, markdown, readable, summary_table
 from dds_lightning.tasks import Task
@@ -69,6 +72,20 @@ action = agent.act(observation)  # a skill every {settings["skill"]["data"]["hor
 
 {textwrap.fill(f"{_limits(task)} {_provenance(str(data.get('source', '')), task)}", 120, break_on_hyphens=False)}
 """
+
+
+def with_diagnosis(card: str, run: Path) -> str:
+    """The card with the section that says which stage loses, before the data.
+
+    Args:
+        card: as `agent_card` wrote it.
+        run: the run directory, its report included.
+    """
+    measured = {stage: run / "report" / f"{stage}_metrics.csv" for stage in ("skill", "policy")}
+    logs = {stage: path for stage, path in measured.items() if path.is_file()}
+    section = diagnosis_section(diagnose(Findings.read(run), logs))
+    head, heading, rest = card.partition("## Data\n")
+    return f"{head}{section}\n\n{heading}{rest}" if heading else f"{card.rstrip()}\n\n{section}\n"
 
 
 def _opening(first: pd.Series, task: Task) -> str:

@@ -26,7 +26,7 @@ def page(found: Findings, files: Mapping[str, str], diagnosis: Mapping[str, pd.D
     parts = [f"# {found.task.name}", _opening(found), _results(found)]
     if "scores" in files:
         parts.append(_picture(files, "scores", "Normalised scores; grey: single skills."))
-    parts.append(_diagnosis(diagnosis))
+    parts.append(diagnosis_section(diagnosis))
     if "trajectories" in files:
         parts.append("## How the policy gets there\n")
         parts.append(_picture(files, "trajectories", f"{found.main}, coloured by the skill in use."))
@@ -128,7 +128,8 @@ def _skills(found: Findings, files: Mapping[str, str]) -> str:
     return text
 
 
-def _diagnosis(tables: Mapping[str, pd.DataFrame]) -> str:
+def diagnosis_section(tables: Mapping[str, pd.DataFrame]) -> str:
+    """The section on where a run loses, from the tables of `diagnosis.diagnose`."""
     text = (
         "## Where it loses\n\nFrom what the data hold, by what a copy of their actions and one skill alone reach, to "
         "what choosing skills reaches.\n\n" + markdown(tables["scores"], {"score": ".1f"})

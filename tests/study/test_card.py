@@ -3,7 +3,7 @@
 import pandas as pd
 import pytest
 
-from dds_lightning.study.card import agent_card
+from dds_lightning.study.card import agent_card, with_diagnosis
 from dds_lightning.tasks import get_task
 
 SETTINGS = {
@@ -80,3 +80,16 @@ def test_the_last_section_is_about_this_task_and_these_data(name, source, known,
     if name.startswith("hopper"):
         assert "success" not in text
         assert "normalised score **75.0 ± 25.0** over 4 episodes, mean return 0.8" in text
+
+
+def test_a_published_runs_card_says_which_stage_loses(tmp_path, monkeypatch):
+    tables = {
+        "scores": pd.DataFrame({"who": ["behaviour cloning"], "score": [6.7]}),
+        "measures": pd.DataFrame({"measure": ["codes in use"], "value": ["16"]}),
+    }
+    monkeypatch.setattr("dds_lightning.study.card.Findings.read", lambda run: run)
+    monkeypatch.setattr("dds_lightning.study.card.diagnose", lambda found, logs: tables)
+    text = with_diagnosis(card("pointmaze-large-diverse", "collected"), tmp_path)
+    assert text.index("## Scores") < text.index("## Where it loses") < text.index("## Data")
+    assert "| behaviour cloning | 6.7 |" in text
+    assert "| codes in use | 16 |" in text
