@@ -7,7 +7,7 @@ from typing import Any
 import docstring_parser
 from jsonargparse import ArgumentParser
 
-from dds_lightning.cli import STAGES, checkpoints, commands, data
+from dds_lightning.cli import STAGES, atlas, checkpoints, commands, data
 from dds_lightning.errors import UserError
 
 Commands = Mapping[str, Any]  # name -> function, a group of commands, or None for one of Lightning's
@@ -19,6 +19,7 @@ COMMANDS: Commands = {
     "relabel": commands.relabel,
     "evaluate": commands.evaluate,
     "report": commands.report,
+    "atlas": atlas.atlas,
     "data": {
         "list": data.list_,
         "show": data.show,

@@ -129,9 +129,9 @@ def draw_starts(ax: Axes, starts: Iterable[NDArray[Any]], cell: float, size: flo
         ax.plot(x, y, "*", markersize=size, color=START, markeredgecolor=START_EDGE, markeredgewidth=0.6, zorder=4)
 
 
-def grid(count: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
-    """A figure of ``count`` equal panels, at most four in a row; the list has only these."""
-    columns = max(min(4, count), 1)
+def grid(count: int, width: float, height: float, columns: int = 4) -> tuple[Figure, list[Axes]]:
+    """A figure of ``count`` equal panels, at most ``columns`` in a row; the list has only these."""
+    columns = max(min(columns, count), 1)
     rows = max(-(-count // columns), 1)
     figure = Figure(figsize=(columns * width, rows * height + 0.45), layout="constrained")
     figure.get_layout_engine().set(w_pad=0.03, h_pad=0.03)  # type: ignore[union-attr, call-arg]

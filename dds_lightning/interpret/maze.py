@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
@@ -32,16 +31,12 @@ from dds_lightning.interpret.drawing import (
     zoom,
 )
 from dds_lightning.interpret.palette import GOAL, START, START_EDGE, skill_colour
+from dds_lightning.interpret.values import plot_value_map as plot_value_map
 from dds_lightning.results import RolloutPath, RolloutResult
 from dds_lightning.tasks import Task
 
-ValueFunction = Callable[[NDArray[np.float32]], NDArray[np.float32]]
-"""Observations (N, O) to values (N,)."""
-
 REACH = 2.5
 """Half a side of the window round a start, in cells."""
-BANDS = 12
-"""Colours of the value map."""
 
 
 def _rows_of(result: RolloutResult, actor: str) -> Any:
@@ -189,6 +184,7 @@ def plot_skills_by_start(
     positions: NDArray[Any],
     codes: NDArray[Any],
     alive: NDArray[Any] | None = None,
+    reach: float | None = None,
 ) -> Figure:
     """All skills from each of several starts, one panel a start, seen from near.
 
@@ -198,6 +194,7 @@ def plot_skills_by_start(
         positions: (N, T + 1, 2) metres.
         codes: (N,) the skill of each replay.
         alive: (N, T) False after a replay's end; all True without it.
+        reach: half a side of the window in metres; without it two cells and a half.
     """
     places, panel = np.unique(np.asarray(starts), axis=0, return_inverse=True)
     figure, axes = grid(len(places), 2.4, 2.45)
@@ -210,7 +207,7 @@ def plot_skills_by_start(
         for n in members:  # above every path
             draw_number(ax, positions[n, lengths[n]], int(codes[n]), size=6.5)
         draw_starts(ax, [positions[n, 0] for n in members], task.cell_size, size=19)
-        zoom(ax, task, places[index], REACH * task.cell_size)
+        zoom(ax, task, places[index], REACH * task.cell_size if reach is None else reach)
         ax.tick_params(labelsize=8)
         ax.xaxis.get_label().set_fontsize(9)
         ax.yaxis.get_label().set_fontsize(9)
@@ -263,69 +260,6 @@ def plot_failures(task: Task, result: RolloutResult, actor: str) -> Figure:
     ax.set_title(title, fontsize=LABEL)
     _legend(ax, "skill in use", codes, lambda count, _: f"{count}×", start=False)
     return figure
-
-
-def plot_value_map(
-    task: Task,
-    value: ValueFunction,
-    codes: Callable[[NDArray[np.float32]], NDArray[np.int64]] | None = None,
-    directions: NDArray[Any] | None = None,
-    resolution: int = 6,
-) -> Figure:
-    """V over the free cells, the body at rest, with the chosen code and where it leads.
-
-    Each colour covers the same area of the maze, so that the slope is seen far from the goal too, where a
-    discounted value is small; the colour bar has the values at which they change.
-
-    Args:
-        task: the maze.
-        value: observations (N, O) to V (N,); position first, then the body as it starts an episode.
-        codes: observations (N, O) to codes (N,), asked at cell centres.
-        directions: (K, 2) mean displacement of each code in metres, for the arrows.
-        resolution: points a cell on each axis.
-    """
-    figure = Figure(figsize=(7.0, 4.7), layout="constrained")
-    ax = figure.add_subplot()
-    draw_walls(ax, task)
-    limits = ax.get_xlim(), ax.get_ylim()
-    half = task.cell_size / 2
-    offsets = (np.arange(resolution) + 0.5) / resolution * task.cell_size - half
-    cells = [task.cell_to_xy(cell) for cell in task.free_cells()]
-    patches = [np.stack(np.meshgrid(offsets, offsets), axis=-1) + centre for centre in cells]  # (R, R, 2) each
-    points = np.concatenate([patch.reshape(-1, 2) for patch in patches])
-    values = np.asarray(value(_at_rest(task, points)), dtype=float).reshape(len(cells), resolution, resolution)
-    edges = np.unique(np.quantile(values, np.linspace(0, 1, BANDS + 1)))
-    if len(edges) < 2:  # the same everywhere
-        edges = edges[0] + np.array([-0.5, 0.5])
-    norm = BoundaryNorm(edges, 256)
-    for centre, patch in zip(cells, values, strict=True):
-        sides = (centre[0] - half, centre[0] + half, centre[1] - half, centre[1] + half)
-        image = ax.imshow(patch, extent=sides, origin="lower", cmap="viridis", norm=norm, zorder=0.5)
-    bar = figure.colorbar(image, ax=ax, shrink=0.9, spacing="uniform", ticks=edges, format="%.3g")
-    bar.set_label("V(s), discounted learning reward", fontsize=LABEL)
-    bar.ax.tick_params(labelsize=9.5)
-    if codes is not None:
-        chosen = np.asarray(codes(_at_rest(task, np.stack(cells))))
-        for centre, code in zip(cells, chosen, strict=True):
-            if directions is not None and (length := float(np.linalg.norm(directions[code]))) > 1e-6:
-                tip = centre + directions[code] / length * 0.48 * task.cell_size
-                outline = [withStroke(linewidth=3.2, foreground="black")]  # seen on dark and on light values
-                line = {"color": "white", "lw": 1.5, "path_effects": outline}
-                arrow = {"arrowstyle": "->", "shrinkA": 0, "shrinkB": 0, **line}
-                ax.annotate("", tuple(tip), tuple(centre), arrowprops=arrow, zorder=5.5)
-            draw_number(ax, centre, int(code), size=8)
-    ax.set(xlim=limits[0], ylim=limits[1])
-    ax.set_title("Value of a body at rest; likeliest skill and where it leads on average", fontsize=LABEL)
-    return figure
-
-
-def _at_rest(task: Task, points: NDArray[Any]) -> NDArray[np.float32]:
-    """Observations (N, O) of a body at rest at positions (N, 2), an ant upright as its episodes begin."""
-    observations = np.zeros((len(points), task.observation_dim), np.float32)
-    observations[:, :2] = points
-    if task.family == "antmaze":
-        observations[:, 2:4] = 0.75, 1.0  # height, and w of the quaternion
-    return observations
 
 
 def choose_episodes(result: RolloutResult, actor: str) -> Sequence[int]:

@@ -10,32 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dds_lightning.files import written_whole
-from dds_lightning.tasks import Cell, Task
+from dds_lightning.interpret.replay import junctions as junctions
+from dds_lightning.interpret.replay import replay_codes, rest_states
+from dds_lightning.tasks import Task
 
 if TYPE_CHECKING:
     from dds_lightning.agent import DDSAgent
 
 Arrays = dict[str, NDArray[np.generic]]
-
-
-def junctions(task: Task, count: int = 8) -> tuple[Cell, ...]:
-    """The task's start, then cells with several ways out, each as far as can be from those before it.
-
-    The goal's cell is left out: there every episode is over at once.
-    """
-    free = set(task.free_cells()) - {task.goal_cell}
-
-    def ways(place: Cell) -> int:
-        i, j = place
-        return sum(neighbour in free for neighbour in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)))
-
-    assert task.start_cell is not None, "mazes have a start"
-    chosen = [task.start_cell]
-    for least in (3, 2, 1):  # where several ways lead on, skills differ most
-        places = [place for place in task.free_cells() if place in free and ways(place) >= least]
-        while len(chosen) < min(count, len(free)) and (rest := [p for p in places if p not in chosen]):
-            chosen.append(max(rest, key=lambda p: min(abs(p[0] - c[0]) + abs(p[1] - c[1]) for c in chosen)))
-    return tuple(chosen)
 
 
 def replay_skills(task: Task, agent: DDSAgent, steps: int = 50, seed: int = 0) -> Arrays:
@@ -45,48 +27,16 @@ def replay_skills(task: Task, agent: DDSAgent, steps: int = 50, seed: int = 0) -
         task: a maze.
         agent: its decoder is used, its policy is not.
         steps: T of each replay, if it does not reach the goal before.
-        seed: of the environments (the exact place in the cell) and of the decoder's noise.
+        seed: of the decoder's noise.
 
     Returns:
         `starts` (N, 2) where the body was set down, the same for all skills of a cell, `positions`
         (N, T + 1, 2) metres, `codes` (N,), `alive` (N, T), with N = cells x K.
     """
-    cells = junctions(task)
-    size, skills = len(cells), agent.num_skills
-    envs = [task.make_env() for _ in cells]
-    positions = np.full((skills, size, steps + 1, 2), np.nan, np.float32)
-    alive = np.zeros((skills, size, steps), bool)
-    try:
-        for code in range(skills):
-            alone = agent.variant("fixed", fixed_codes=[code])
-            alone.reset(size, seed)
-            states = [
-                env.reset(seed=seed, options={"reset_cell": np.array(place)})
-                for env, place in zip(envs, cells, strict=True)
-            ]
-            observations = np.stack([observation for observation, _ in states])
-            positions[code, :, 0] = [info["position"] for _, info in states]
-            going = np.arange(size)
-            for t in range(steps):
-                if not len(going):
-                    break
-                actions = alone.act(observations[going], rows=going)
-                alive[code, going, t] = True
-                ended = np.zeros(len(going), bool)
-                for i, (slot, action) in enumerate(zip(going, actions, strict=True)):
-                    observations[slot], _, terminated, truncated, info = envs[slot].step(action)
-                    positions[code, slot, t + 1] = info["position"]
-                    ended[i] = terminated or truncated
-                going = going[~ended]
-    finally:
-        for env in envs:
-            env.close()
-    return {
-        "starts": positions[:, :, 0].reshape(skills * size, 2),
-        "positions": positions.reshape(skills * size, steps + 1, 2),
-        "codes": np.repeat(np.arange(skills), size),
-        "alive": alive.reshape(skills * size, steps),
-    }
+    states = rest_states(task, junctions(task))
+    made = replay_codes(task, agent.skill, states, steps=steps, noise_scale=agent.noise_scale, seed=seed)
+    positions = made.qpos[..., :2].astype(np.float32)
+    return {"starts": positions[:, 0], "positions": positions, "codes": made.codes, "alive": made.alive}
 
 
 def stored_replays(path: Path, task: Task, directory: Path) -> Arrays:

@@ -151,35 +151,27 @@ def _draw_maze(found: Findings, folder: Path, keep: Any, made: dict[str, Path]) 
     keep("failed_ends", maze.plot_failures(task, result, main))
     agent = found.root / "agent"
     if (agent / "SHA256SUMS").is_file():
-        replays = stored_replays(folder / "replays.npz", task, agent)
-        keep("starts_by_skill", maze.plot_starts_by_skill(task, **replays))
-        keep("skills_by_start", maze.plot_skills_by_start(task, **replays))
+        stored = stored_replays(folder / "replays.npz", task, agent)
+        starts, positions, codes, alive = (stored[name] for name in ("starts", "positions", "codes", "alive"))
+        keep("starts_by_skill", maze.plot_starts_by_skill(task, starts, positions, codes, alive))
+        keep("skills_by_start", maze.plot_skills_by_start(task, starts, positions, codes, alive))
         keep("values", _value_map(found, agent))
 
 
 def _value_map(found: Findings, directory: Path) -> Any:
     """The published critic over the maze, with the policy's likeliest codes and where the data say they lead."""
     import numpy as np
-    import torch
 
     from dds_lightning.agent import DDSAgent
-    from dds_lightning.interpret import maze
+    from dds_lightning.interpret.values import plot_value_map, value_and_codes
 
     policy = DDSAgent.load(directory).policy
     assert policy is not None, "a run's agent has a policy"
-
-    @torch.inference_mode()
-    def value(observations: Any) -> Any:
-        return policy.v(torch.from_numpy(observations)).numpy()
-
-    @torch.inference_mode()
-    def codes(observations: Any) -> Any:
-        return policy.codes(torch.from_numpy(observations), selection="greedy").numpy()
-
+    value, codes = value_and_codes(policy)
     directions = None
     if "dx" in found.skills:
         directions = np.nan_to_num(found.skills[["dx", "dy"]].to_numpy())
-    return maze.plot_value_map(found.task, value, codes, directions)
+    return plot_value_map(found.task, value, codes, directions)
 
 
 def _metrics(root: Path, stage: str, folder: Path) -> Path | None:

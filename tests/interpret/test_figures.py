@@ -130,6 +130,8 @@ def test_the_window_of_a_start_is_five_cells_inside_the_maze(replays):
     assert (corner.get_xlim(), corner.get_ylim()) == ((-6.0, -1.0), (-4.5, 0.5))
     x, y = large.cell_to_xy((5, 6))
     assert (middle.get_xlim(), middle.get_ylim()) == ((x - 2.5, x + 2.5), (y - 2.5, y + 2.5))
+    near = plot_skills_by_start(large, starts, np.stack([starts] * 3, axis=1), np.zeros(2, int), reach=1.0).axes[1]
+    assert near.get_xlim() == (x - 1.0, x + 1.0)
 
 
 def test_every_skill_has_a_panel_with_every_start(replays):

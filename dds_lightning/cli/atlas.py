@@ -1,0 +1,94 @@
+"""The command `dds atlas`: the signature is the command line, the docstring the help."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from dds_lightning.cli.arguments import data_spec
+from dds_lightning.errors import UserError
+from dds_lightning.reports import Report, pairs, table
+
+STAGES = 11
+"""What the progress bar counts when nothing is compared; about so many things are done."""
+SHOWN = ("code", "share", "again", "recovered", "distance", "speed", "reward", "value", "alone")
+"""Columns of the table that is printed; the page has them all."""
+
+
+def atlas(
+    place: str,
+    data: str | None = None,
+    task: str | None = None,
+    out: str = "atlas.html",
+    episodes: int = 5,
+    against: list[str] = [],  # noqa: B006 - jsonargparse shows the default and nobody changes it
+    seed: int = 0,
+) -> Report:
+    """Look at the skills of a checkpoint: one HTML page with pictures, clips and numbers, which opens offline.
+
+    Every skill is replayed in the task's environment, from the same states; episodes show how the policy strings them
+    together; tables say what each does in the data, and how well it is told from the behaviour that it produces.
+
+    With --json: `atlas` (the page), `task`, `horizon`, `num_skills`, `segments` (of the data that were encoded),
+    `skills` (a row a code), `round_trip` and `recovery` (accuracy, its error, chance, control, confusion, information
+    in bits), `transitions` and `distances` (K x K), `comparison` (a row a model, or null). What is not measured is
+    null.
+
+    Args:
+        place: a run of `dds run`, a published directory, hf:OWNER/NAME, or a skill checkpoint (.ckpt)
+        data: local:DIR, minari:ID, d4rl:FILE, arrays:DIR, or just a folder or file; a run knows its own
+        task: name of the task; without it the one that the checkpoint was made for
+        out: the HTML file to write
+        episodes: of the policy and of each single skill that are played, unless a run has played already; 0 for none
+        against: other skill checkpoints, for example of other seeds or with continuous skills, to compare with
+        seed: of everything random
+    """
+    from dds_lightning.hub import is_hub, pull
+
+    page = Path(out)
+    if page.suffix != ".html" or page.is_dir():
+        raise UserError(f"--out is {out}, expected the name of a file that ends in .html")
+    if episodes < 0:
+        raise UserError(f"--episodes is {episodes}, expected a number of episodes, or 0 for none")
+    root = pull(place) if is_hub(place) else Path(place)
+    if not root.exists():
+        raise UserError(f"there is no {place}: give a run of `dds run`, a published directory or a skill checkpoint")
+    spec = data_spec(data) if data else None
+
+    from dds_lightning.study.atlas import atlas as make
+
+    with _progress(STAGES + len(against)) as tell:
+        made, path = make(root, spec, task, page, episodes, [Path(one) for one in against], seed, tell)
+    found, trip, shown = made.recovery, made.trip, made.table[[name for name in SHOWN if name in made.table]]
+    lines = [
+        ("codes in use", f"{len(found.codes)} of {len(made.table)}"),
+        (
+            "found again",
+            f"{100 * trip.accuracy:.1f} % of replays in own states, another code held {100 * trip.control:.1f} %",
+        ),
+        ("recovered", f"{100 * found.accuracy:.1f} % of replays from any state"),
+        ("chance", f"{100 * found.chance:.1f} %"),
+        ("about where it leads", f"{found.information_in_state:.2f} bits in a state, at most {found.most:.2f}"),
+        ("page", f"{path} ({path.stat().st_size / 1e6:.1f} MB)"),
+    ]
+    return Report({"atlas": path, **made.facts()}, [table(shown), pairs(lines)])
+
+
+@contextlib.contextmanager
+def _progress(total: int) -> Iterator[Callable[[str], None]]:
+    """A bar on standard error that is told in words what is being done; lines where that is no terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    columns = (SpinnerColumn(), BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        line = bar.add_task("atlas", total=total)
+
+        def tell(words: str) -> None:
+            bar.update(line, advance=1, description=words)
+            if not console.is_terminal:
+                console.print(words, highlight=False)
+
+        yield tell

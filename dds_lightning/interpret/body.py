@@ -1,0 +1,185 @@
+"""Where a body's limbs and joints are, from the simulator's own model: what stick figures are drawn from.
+
+```
+ qpos (T, nq) ──► mj_kinematics ──► limbs (T, L, 2, 3): both ends of every limb's capsule
+                                    joints (T, J, 3):   every joint between limbs
+```
+
+No picture is rendered, so no graphics driver is needed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from dds_lightning.tasks import Task
+
+ARM = 9
+"""Joints of the kitchen's robot; those after them move its objects."""
+
+THINGS = {
+    "slidelink": "slide cabinet",
+    "hingeleftdoor": "hinge cabinet",
+    "hingerightdoor": "",
+    "microdoorroot": "microwave",
+    "kettle": "kettle",
+    "lightswitchroot": "light switch",
+    "lightblock_hinge": "",
+}
+"""Bodies of the kitchen's model to what they are called; knobs and burners have their own names."""
+
+Floats = NDArray[np.float64]
+
+
+class View(NamedTuple):
+    """From where a body is drawn.
+
+    Attributes:
+        axes: which of x, y, z run to the right and up.
+        labels: of the two axes.
+        ground: whether the ground is the line z = 0.
+    """
+
+    axes: tuple[int, int]
+    labels: tuple[str, str]
+    ground: bool
+
+
+SIDE = View((0, 2), ("x (m)", "z (m)"), True)
+ABOVE = View((0, 1), ("x (m)", "y (m)"), False)
+FRONT = View((0, 2), ("x (m)", "z (m)"), False)
+
+
+def view_of(task: Task) -> View:
+    """A runner is seen from the side, an ant from above, the kitchen from behind the robot."""
+    return {"locomotion": SIDE, "kitchen": FRONT}.get(task.family, ABOVE)
+
+
+def has_limbs(task: Task) -> bool:
+    """Whether there is more to draw than a point."""
+    return task.family != "pointmaze"
+
+
+@dataclass(frozen=True, eq=False)
+class BodyFrames:
+    """A body at T moments.
+
+    Attributes:
+        limbs: (T, L, 2, 3) metres, both ends of every limb; the same twice for a ball.
+        widths: (L,) metres, their thickness.
+        joints: (T, J, 3) metres, the joints between limbs.
+        root: (T, 3) metres: the torso, in the kitchen the hand.
+        objects: (T, M, 3) metres: in the kitchen what can be moved, elsewhere nothing.
+        names: M names.
+    """
+
+    limbs: Floats
+    widths: Floats
+    joints: Floats
+    root: Floats
+    objects: Floats
+    names: tuple[str, ...]
+
+    def __len__(self) -> int:
+        """T."""
+        return len(self.root)
+
+
+def body_frames(model: Any, qpos: NDArray[Any]) -> BodyFrames:
+    """Work out where limbs and joints are.
+
+    Args:
+        model: the simulator's model, for example ``env.unwrapped.model``.
+        qpos: (T, nq) positions; rows after the end of a replay (NaN) are left out.
+    """
+    qpos = np.asarray(qpos, dtype=np.float64)
+    qpos = qpos[np.isfinite(qpos).all(axis=1)]
+    data = mujoco.MjData(model)
+    skeleton = _Skeleton(model)
+    frames: list[tuple[Floats, Floats, Floats, Floats]] = []
+    for row in qpos:
+        data.qpos[:] = row
+        mujoco.mj_kinematics(model, data)
+        frames.append(skeleton.at(data))
+    limbs, joints, root, objects = (np.stack(part) for part in zip(*frames, strict=True))
+    return BodyFrames(limbs, skeleton.widths, joints, root, objects, skeleton.names)
+
+
+class _Skeleton:
+    """Which parts of a model are limbs, joints and movable things."""
+
+    def __init__(self, model: Any) -> None:
+        moving = model.body_weldid[model.geom_bodyid] != 0
+        round_ones = [mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE]
+        self.geoms = np.flatnonzero(moving & np.isin(model.geom_type, round_ones))
+        long = model.geom_type[self.geoms] == mujoco.mjtGeom.mjGEOM_CAPSULE
+        self.half = np.where(long, model.geom_size[self.geoms, 1], 0.0)
+        self.arm = np.zeros(0, np.int64)
+        self.objects: list[NDArray[np.int64]] = []  # geoms of each movable thing
+        self.names: tuple[str, ...] = ()
+        body = model.jnt_bodyid
+        self.body = int(body[0])  # a torso
+        hinges = np.flatnonzero((model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE) & (body != self.body))
+        self.widths = 2 * model.geom_size[self.geoms, 0]
+        if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "panda0_link1") >= 0:
+            # The kitchen's arm is made of meshes: its limbs are the lines from joint to joint.
+            self.arm = body[:ARM]
+            self.body = int(self.arm[6])
+            hinges = np.arange(7)
+            self.widths = np.full(ARM - 1, 0.07)
+            self.widths[-2:] = 0.03
+            things = [int(b) for b in dict.fromkeys(body[ARM:])]
+            self.objects = [np.flatnonzero(model.body_weldid[model.geom_bodyid] == b) for b in things]
+            own = [model.body(b).name for b in things]
+            self.names = tuple(THINGS.get(name, name.lower()) for name in own)
+        self.hinges = hinges
+
+    def at(self, data: Any) -> tuple[Floats, Floats, Floats, Floats]:
+        """Limbs (L, 2, 3), joints (J, 3), root (3,), objects (M, 3)."""
+        if len(self.arm):
+            place = data.xpos[self.arm]  # (9, 3)
+            parents = np.minimum(np.arange(ARM - 1), 6)  # both fingers are of the hand
+            limbs = np.stack([place[parents], place[1:]], axis=1)
+            root = place[7:].mean(axis=0)
+        else:
+            centre = data.geom_xpos[self.geoms]  # (L, 3)
+            along = data.geom_xmat[self.geoms].reshape(-1, 3, 3)[:, :, 2] * self.half[:, None]
+            limbs = np.stack([centre - along, centre + along], axis=1)
+            root = data.xpos[self.body].copy()
+        objects = np.array([data.geom_xpos[geoms].mean(axis=0) for geoms in self.objects]).reshape(-1, 3)
+        return limbs, data.xanchor[self.hinges].copy(), root, objects
+
+
+def root_path(task: Task, model: Any, qpos: NDArray[Any]) -> Floats:
+    """Where a body is while it is replayed.
+
+    Args:
+        task: the environment.
+        model: its model.
+        qpos: (N, T + 1, nq); NaN after a replay's end.
+
+    Returns:
+        (N, T + 1, D) metres: x and y in a maze, x and z of a runner, x, y and z of the kitchen's hand; NaN as `qpos`.
+    """
+    if task.family != "kitchen":
+        return np.asarray(qpos[..., :2], dtype=np.float64)
+    flat = qpos.reshape(-1, qpos.shape[-1])
+    known = np.isfinite(flat).all(axis=1)
+    places = np.full((len(flat), 3), np.nan)
+    if known.any():
+        places[known] = body_frames(model, flat[known]).root
+    return places.reshape(*qpos.shape[:-1], 3)
+
+
+PATH_NAMES = {"locomotion": ("x", "z"), "kitchen": ("x", "y", "z")}
+"""Names of the D coordinates of `root_path`; in a maze x and y."""
+
+
+def path_names(task: Task) -> tuple[str, ...]:
+    """Names of the coordinates of `root_path`."""
+    return PATH_NAMES.get(task.family, ("x", "y"))
