@@ -8,7 +8,7 @@ BIN    := $(VENV)/bin
 PYTEST_ARGS ?= -n auto --dist loadscope -m 'not faults'
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test faults lint format notebooks notebooks-env clean
+.PHONY: help demo test faults lint format audit notebooks notebooks-env clean
 
 help:  ## show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */\1|/' | awk -F'|' '{printf "  make %-14s %s\n", $$1, $$2}'
@@ -42,6 +42,11 @@ lint: $(VENV)/.installed  ## ruff and mypy, changing nothing
 format: $(VENV)/.installed  ## let ruff mend what it can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+# Not of the environment's own extras: who only trains and tests needs no auditor.
+audit: $(VENV)/.installed  ## look every pinned version up among known vulnerabilities (needs a network)
+	$(BIN)/python -m pip install --quiet 'pip-audit>=2.7' --constraint constraints.txt
+	$(BIN)/pip-audit --requirement constraints.txt --no-deps --disable-pip --strict --progress-spinner off
 
 notebooks: $(VENV)/.notebooks  ## execute all notebooks anew, about five minutes
 	$(BIN)/python notebooks/execute.py

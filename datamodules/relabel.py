@@ -11,23 +11,24 @@ the bootstrap, and the encoder averages over the h steps alone. A segment that a
 skill was not carried through, and nothing ended.
 """
 
-import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 import torch
 from rich.progress import track
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from datamodules.kept_codes import KeptCodes
 from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError
-from dds_lightning.files import written_whole
+from dds_lightning.files import refuse_newer, written_whole
 from dds_lightning.skill import SkillModule
 
 Discount = Literal["per_skill", "per_step"]
@@ -117,13 +118,14 @@ class Relabelled:
 
     def save(self, path: str | Path, key: dict[str, str | int | float]) -> None:
         """Write the transitions and what they were made from, atomically, as one safetensors file."""
-        metadata = {
-            "format": str(FORMAT),
-            "num_skills": str(self.num_skills),
-            "key": json.dumps(key, sort_keys=True),
-        }
+        # In one entry: safetensors writes several in any order, and the same transitions shall be the same bytes.
+        about = {"format": FORMAT, "num_skills": self.num_skills, "key": key}
+        metadata = {"about": json.dumps(about, sort_keys=True)}
         with written_whole(Path(path)) as part:
-            save_file({name: getattr(self, name).contiguous().cpu() for name in _STORED}, part, metadata=metadata)
+            try:
+                save_file({name: getattr(self, name).contiguous().cpu() for name in _STORED}, part, metadata=metadata)
+            except SafetensorError as error:  # its word for an error of the disk
+                raise UserError(f"{path} could not be written: {error}") from None
             part.chmod(0o644)  # safetensors writes for the owner alone
 
     @classmethod
@@ -145,18 +147,53 @@ class Relabelled:
             raise UserError(f"there is no relabelled file {path}: make it with `dds relabel`") from None
         except Exception as error:
             raise UserError(f"{path} is no readable relabelled file ({error}): delete it and relabel") from error
-        if metadata.get("format") != str(FORMAT):
-            raise UserError(
-                f"{path} has relabelling format {metadata.get('format')!r}, this version reads {FORMAT}: relabel"
-            )
-        found = json.loads(metadata["key"])
+        about = _about(metadata, path)
+        found = about["key"]
         if key is not None and found != json.loads(json.dumps(key)):
             pairs = {name: (found.get(name), value) for name, value in key.items() if found.get(name) != value}
             wrong = [f"{name} {there!r} instead of {wanted!r}" for name, (there, wanted) in pairs.items()]
             raise UserError(
                 f"{path} was relabelled with other inputs ({'; '.join(wrong)}): choose another file or relabel"
             )
-        return cls(**tensors, num_skills=int(metadata["num_skills"]))
+        damage = _misfit(tensors, about["num_skills"])
+        if damage:
+            raise UserError(f"{path} is no readable relabelled file ({damage}): delete it and relabel")
+        return cls(**tensors, num_skills=about["num_skills"])
+
+
+def _misfit(tensors: Mapping[str, Tensor], num_skills: int) -> str | None:
+    """What is wrong with the tensors of a file; None if they are transitions of that many codes."""
+    if tensors.keys() != set(_STORED):
+        return f"it holds {', '.join(sorted(tensors)) or 'nothing'}, expected {', '.join(_STORED)}"
+    rows = len(tensors["codes"]) if tensors["codes"].ndim else 0
+    for name, value in tensors.items():
+        wide = name in ("observations", "next_observations")
+        if not rows or value.ndim != 1 + wide or len(value) != rows:
+            return f"{name} has shape {tuple(value.shape)}, expected {rows or 'some'} rows as codes"
+        if value.dtype != (torch.int64 if name in ("codes", "starts", "episodes") else torch.float32):
+            return f"{name} is of type {value.dtype}"
+        if value.is_floating_point() and not bool(torch.isfinite(value).all()):
+            return f"{name} holds numbers that are not finite"
+    codes = tensors["codes"]
+    if int(codes.min()) < 0 or int(codes.max()) >= num_skills:
+        return f"codes run from {int(codes.min())} to {int(codes.max())}, expected 0 to {num_skills - 1}"
+    return None
+
+
+def _about(metadata: Mapping[str, str], path: str | Path) -> dict[str, Any]:
+    """What a file says of itself; an earlier version wrote it in three entries.
+
+    Raises:
+        UserError: it is of a newer version, or says nothing that can be understood.
+    """
+    try:
+        about = json.loads(metadata["about"]) if "about" in metadata else dict(metadata)
+        found = json.loads(about["key"]) if isinstance(about["key"], str) else dict(about["key"])
+        told = {"format": int(about["format"]), "num_skills": int(about["num_skills"]), "key": found}
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{path} is no readable relabelled file ({error!r}): delete it and relabel") from None
+    refuse_newer(path, told["format"], FORMAT)
+    return told
 
 
 def relabel_key(
@@ -170,13 +207,9 @@ def relabel_key(
     reward_shift: float,
 ) -> dict[str, str | int | float]:
     """Everything a relabelled set depends on: data, skill weights, H, gamma, discount, stride, reward convention."""
-    digest = hashlib.sha256()
-    for name, tensor in sorted(skill.state_dict().items()):
-        digest.update(name.encode())
-        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
     return {
         "data": trajectories.fingerprint(),
-        "skill": digest.hexdigest(),
+        "skill": skill.fingerprint(),
         "horizon": skill.horizon,
         "gamma": gamma,
         "discount": discount,
@@ -198,6 +231,7 @@ def relabel(
     reward_shift: float = 0.0,
     batch_size: int = 2048,
     progress: bool = False,
+    kept: KeptCodes | None = None,
 ) -> Relabelled:
     """Turn every segment into a semi-MDP transition (section 4.2).
 
@@ -211,6 +245,7 @@ def relabel(
         reward_shift: see ``reward_scale``.
         batch_size: segments encoded at once.
         progress: show a bar.
+        kept: where codes are kept on the way and where those of an earlier, stopped call are.
 
     Raises:
         UserError: widths that differ between data and model, no segment of H steps, gamma out of range.
@@ -224,23 +259,31 @@ def relabel(
     steps = np.minimum(np.arange(horizon), lengths[:, None] - 1)  # (M, H): a short segment repeats its last step
     device = skill.device
 
-    codes = []
-    batches = range(0, len(starts), batch_size)
-    was_training = skill.training
-    skill.eval()
-    for first in track(batches, "relabelling", disable=not progress, transient=True):
-        rows = slice(first, first + batch_size)
+    def encode(rows: slice) -> Tensor:
         observations = trajectories.observations[observation_starts[rows, None] + steps[rows]]  # (B, H, O)
         actions = trajectories.actions[starts[rows, None] + steps[rows]]  # (B, H, A)
         short = lengths[rows] < horizon
-        codes.append(
-            skill.encode(
-                torch.as_tensor(observations, device=device),
-                torch.as_tensor(actions, device=device),
-                torch.as_tensor(lengths[rows], device=device) if short.any() else None,
-            ).cpu()
-        )
-    skill.train(was_training)
+        return skill.encode(
+            torch.as_tensor(observations, device=device),
+            torch.as_tensor(actions, device=device),
+            torch.as_tensor(lengths[rows], device=device) if short.any() else None,
+        ).cpu()
+
+    codes = [] if kept is None else kept.read()
+    batches = range(sum(map(len, codes)), len(starts), batch_size)
+    was_training = skill.training
+    skill.eval()
+    try:
+        for first in track(batches, "relabelling", disable=not progress, transient=True):
+            codes.append(encode(slice(first, first + batch_size)))
+            if kept is not None:
+                kept.write_now_and_then(codes)
+    except BaseException:
+        if kept is not None:
+            kept.write(codes)
+        raise
+    finally:
+        skill.train(was_training)
 
     learning = reward_scale * (trajectories.rewards.astype(np.float64) + reward_shift)  # (N,)
     rewards = np.zeros(len(starts))

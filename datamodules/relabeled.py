@@ -12,6 +12,7 @@ import lightning.pytorch as pl
 import torch
 from torch import Tensor
 
+from datamodules.kept_codes import KeptCodes
 from datamodules.relabel import Discount, Relabelled, relabel, relabel_key
 from datamodules.segments import TensorLoader
 from datamodules.sources import load_trajectories, resolve_task
@@ -77,6 +78,7 @@ class RelabeledDataModule(pl.LightningDataModule):
         self.skill = SkillModule.load(skill)
         self.observation_dim: int = self.skill.hparams.observation_dim
         self.num_skills: int = self.skill.num_skills
+        self.skill_hash = self.skill.fingerprint()
         self.transitions: Relabelled | None = None
         self._given: Trajectories | None = None
 
@@ -136,9 +138,16 @@ class RelabeledDataModule(pl.LightningDataModule):
     def prepare_data(self) -> None:
         """Relabel, unless the result of exactly these inputs is on disk."""
         if self.hparams.relabelled is None and not self.cache_file().exists():
-            made = relabel(self.trajectories, self.skill, **self.settings, progress=True)
-            made.save(self.cache_file(), self.key)
-            log.info("relabelled %d segments into %s", len(made), self.cache_file())
+            self.relabel_into(self.cache_file())
+
+    def relabel_into(self, path: Path) -> Relabelled:
+        """Relabel and write the result to `path`; a call that was stopped goes on when it is made again."""
+        kept = KeptCodes(path, self.key)
+        made = relabel(self.trajectories, self.skill, **self.settings, progress=True, kept=kept)
+        made.save(path, self.key)
+        kept.remove()
+        log.info("relabelled %d segments into %s", len(made), path)
+        return made
 
     def setup(self, stage: str | None = None) -> None:
         """Read the transitions and split them by episode."""

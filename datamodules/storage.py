@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-import os
-import shutil
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,7 +13,7 @@ from numpy.typing import NDArray
 
 from datamodules.validation import DataError
 from dds_lightning.errors import UserError
-from dds_lightning.files import sync
+from dds_lightning.files import folder_written_whole, mend_folder, refuse_newer
 
 FORMAT = 1
 
@@ -25,27 +23,19 @@ def save_arrays(
 ) -> Path:
     """Write `directory` with one .npy file an array and `trajectories.json`, which holds `facts` and the format.
 
-    Everything goes into a hidden sibling folder first, so that the folder is whole or absent.
+    The folder is whole or absent (`dds_lightning.files.folder_written_whole`).
 
     Raises:
         UserError: When the folder exists and `overwrite` is False.
     """
     folder = Path(directory)
     refuse_existing(folder, overwrite)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", suffix=".partial", dir=folder.parent))
-    try:
-        partial.chmod(0o755)
+    with folder_written_whole(folder) as part:
         for key, array in arrays.items():
-            path = partial / f"{key}.npy"
-            with path.open("wb") as file:
-                np.save(file, array, allow_pickle=False)
-            sync(path)
-        write_durably(partial / "trajectories.json", json.dumps({"format": FORMAT, **facts}, indent=1))
-        put_in_place(partial, folder, overwrite)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
+            np.save(part / f"{key}.npy", array, allow_pickle=False)
+        text = json.dumps({"format": FORMAT, **facts}, indent=1)
+        (part / "trajectories.json").write_text(text, encoding="utf-8")
+        refuse_existing(folder, overwrite)
     return folder
 
 
@@ -64,15 +54,17 @@ def read_arrays(
 
     Raises:
         DataError: When a file is missing, damaged or of another type.
+        UserError: When a newer version of this package wrote them.
     """
     folder = Path(directory).expanduser()
+    with contextlib.suppress(OSError):
+        mend_folder(folder)
     try:
         facts = json.loads((folder / "trajectories.json").read_text(encoding="utf-8"))
         name, version, _ = str(facts["name"]), facts["format"], facts["fingerprint"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"data: {folder / 'trajectories.json'} is missing or damaged ({error!r})") from error
-    if version != FORMAT:
-        raise DataError(f"data set '{name}': its format is {version}, expected {FORMAT}; write it again")
+    refuse_newer(folder / "trajectories.json", version, FORMAT)
     arrays = {}
     for key, dtype in types.items():
         path = folder / f"{key}.npy"
@@ -87,24 +79,6 @@ def read_arrays(
 
 def refuse_existing(folder: Path, overwrite: bool) -> None:
     """Raise UserError when `folder` exists and may not be replaced."""
+    mend_folder(folder)
     if folder.exists() and not overwrite:
         raise UserError(f"out: {folder} exists already; choose another place, or ask for it to be overwritten")
-
-
-def write_durably(path: Path, text: str) -> None:
-    """Write a text file and wait until it is on the disk."""
-    path.write_text(text, encoding="utf-8")
-    sync(path)
-
-
-def put_in_place(partial: Path, folder: Path, overwrite: bool) -> None:
-    """Give a complete folder its name, replacing an old one of that name if allowed."""
-    refuse_existing(folder, overwrite)
-    old: Path | None = None
-    if folder.exists():
-        old = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", suffix=".old", dir=folder.parent))
-        os.replace(folder, old / "replaced")
-    os.replace(partial, folder)
-    if old is not None:
-        shutil.rmtree(old, ignore_errors=True)
-    sync(folder.parent)

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
 from dds_lightning.errors import UserError
+from dds_lightning.files import short
 
 if TYPE_CHECKING:
     from dds_lightning.policy import PolicyModule
@@ -98,6 +99,12 @@ class DDSAgent(nn.Module):
                 mine, other = self.skill.hparams[name], self.policy.hparams[name]
                 if mine != other:
                     raise UserError(f"{name} is {mine} in the skill model and {other} in the policy: no pair")
+            learnt_with = self.policy.hparams.get("skill_hash")
+            if learnt_with and learnt_with != (found := self.skill.fingerprint()):
+                raise UserError(
+                    f"the policy was trained on the codes of skill model {short(learnt_with)}, this one is "
+                    f"{short(found)}: no pair; give the skill checkpoint that the policy learnt with"
+                )
 
     # ---------------------------------------------------------------- acting
 

@@ -5,6 +5,7 @@ The directory that is published afterwards is in `dds_lightning.publishing`.
 
 from __future__ import annotations
 
+import errno
 import os
 import pickle
 import zipfile
@@ -16,10 +17,14 @@ from lightning.fabric.plugins import TorchCheckpointIO
 from torch import nn
 
 from dds_lightning.errors import UserError
-from dds_lightning.files import neighbours, written_whole
+from dds_lightning.files import neighbours, refuse_newer, written_whole
 from dds_lightning.publishing import Published as Published
 from dds_lightning.publishing import build_module, load_published
 from dds_lightning.publishing import publish as publish
+
+FORMAT = 1
+FORMAT_KEY = "dds_format"
+"""Entry of a `.ckpt` that holds its version; files of before it have none and are of the first."""
 
 M = TypeVar("M", bound=nn.Module)
 
@@ -28,7 +33,8 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     """Lightning's checkpoint files, written beside their place, synced, checked and only then renamed.
 
     A full disk, a kill or a read-only folder leaves the previous file as it was, and the error is raised.
-    Local paths only.
+    Local paths only. The file says which version of the format it has; one that was written on an accelerator loads
+    on a CPU.
     """
 
     def save_checkpoint(
@@ -48,39 +54,38 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         if storage_options is not None:
             raise TypeError("storage_options are for remote storage; checkpoints are written to local paths")
         with written_whole(Path(path)) as part:
-            torch.save(checkpoint, part)
+            _write({**checkpoint, FORMAT_KEY: FORMAT}, part)
             try:
                 _check_sums(part)
             except zipfile.BadZipFile as error:
-                raise OSError(f"{path} reads back differently ({error}); the disk may be full or failing") from None
+                told = f"it reads back differently: {error}; the disk may be full or failing"
+                raise OSError(errno.EIO, told) from None
 
     def load_checkpoint(
-        self,
-        path: str | os.PathLike[str],
-        map_location: Any = lambda storage, _: storage,
-        weights_only: bool | None = None,
+        self, path: str | os.PathLike[str], map_location: Any = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
-        """Load a checkpoint of tensors and plain values; `weights_only` is always on.
+        """Load a checkpoint of tensors and plain values on the CPU; `weights_only` is always on.
 
         Raises:
             UserError: there is no such file, it is damaged, or it holds other objects.
         """
-        del weights_only
-        return load_ckpt(path, map_location)
+        del map_location, weights_only  # a Trainer moves what it loads to its own device
+        return load_ckpt(path)
 
 
-def load_ckpt(path: str | os.PathLike[str], map_location: Any = "cpu") -> dict[str, Any]:
-    """Read a `.ckpt` without running anything that it may contain.
+def load_ckpt(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read a `.ckpt` on the CPU, wherever it was written, without running anything that it may contain.
 
     Raises:
-        UserError: there is no such file, it is damaged, or it holds more than tensors and plain values.
+        UserError: there is no such file, it is damaged or of a newer version, or it holds more than tensors and plain
+            values.
     """
     path = Path(path)
     if not path.is_file():
         raise UserError(f"there is no checkpoint {path}{neighbours(path)}")
     try:
         _check_sums(path)
-        checkpoint = torch.load(path, map_location=map_location, weights_only=True)
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         reason = str(error).split("\n", 1)[0]
         raise UserError(f"{path} is damaged, or holds more than tensors and plain values: {reason}") from None
@@ -88,7 +93,17 @@ def load_ckpt(path: str | os.PathLike[str], map_location: Any = "cpu") -> dict[s
         raise UserError(f"{path} is not a readable checkpoint, cut short perhaps: {error}") from None
     if not isinstance(checkpoint, dict) or not isinstance(checkpoint.get("state_dict"), dict):
         raise UserError(f"{path} is not a Lightning checkpoint: it has no state_dict")
+    refuse_newer(path, checkpoint.get(FORMAT_KEY, FORMAT), FORMAT)
     return checkpoint
+
+
+def _write(checkpoint: dict[str, Any], path: Path) -> None:
+    """Like `torch.save`, but with the disk's own error where it fails: torch tells only of an unexpected position."""
+    try:
+        with path.open("wb") as file:
+            torch.save(checkpoint, file)
+    except RuntimeError as error:
+        raise (error.__context__ if isinstance(error.__context__, OSError) else error) from None
 
 
 def _check_sums(path: Path) -> None:

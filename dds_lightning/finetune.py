@@ -14,6 +14,7 @@ training saves loads without it, and resumes without it.
 - What a policy keeps of its data beside that, support of the codes and range of values, is always the new data's.
 """
 
+import hashlib
 import logging
 import os
 import warnings
@@ -26,6 +27,7 @@ import torch
 from torch import Tensor
 
 from dds_lightning.errors import UserError
+from dds_lightning.files import short
 from dds_lightning.nn.normaliser import Normaliser
 from dds_lightning.optim import adam
 
@@ -138,6 +140,14 @@ class StageModule(pl.LightningModule):
             ]
         return adam(parameters, h.lr, h.lr_schedule, h.warmup_steps, self)
 
+    def fingerprint(self) -> str:
+        """SHA-256 of all weights and buffers with their names: the same for the same model, wherever it lies."""
+        digest = hashlib.sha256()
+        for name, tensor in sorted(self.state_dict().items()):
+            digest.update(name.encode())
+            digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+        return digest.hexdigest()
+
     @classmethod
     def load(cls, path: str | Path) -> Self:
         """Load from a Lightning ``.ckpt`` or a published directory, in evaluation mode on the CPU."""
@@ -171,6 +181,7 @@ def start_from(module: StageModule, path: str) -> None:
     if not bool(source.normaliser.fitted):
         raise UserError(f"model.init_from: {path} was saved before its training began: give a trained checkpoint")
     refuse_other_shape(module, source, path)
+    refuse_other_skills(module, source, path)
     own, theirs = module.state_dict(), source.state_dict()
     if "bottleneck.ema_sum" in own and "bottleneck.ema_sum" not in theirs:
         # Running averages begin at the vectors, or the first step would throw them back to random ones.
@@ -216,6 +227,16 @@ def refuse_other_shape(module: StageModule, source: StageModule, path: str) -> N
         if "num_skills" in other and module.STAGE == "policy":
             remedy = "relabel with the skill model of that policy (data.skill)"
         raise UserError(f"{found}, but model.init_from {path} was trained with {was}: give {remedy}, or start anew")
+
+
+def refuse_other_skills(module: StageModule, source: StageModule, path: str) -> None:
+    """Refuse a policy that chose among the codes of another skill model: the same numbers mean other skills there."""
+    there, here = (one.hparams.get("skill_hash") for one in (source, module))
+    if there and here and there != here:
+        raise UserError(
+            f"data.skill is skill model {short(here)}, but model.init_from {path} was trained on the codes of skill "
+            f"model {short(there)}: give that one as data.skill, or start anew"
+        )
 
 
 def refuse_other_box(module: Any, datamodule: Any) -> None:

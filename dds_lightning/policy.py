@@ -62,6 +62,7 @@ class PolicyModule(StageModule):
         lr_scale: factor on ``lr`` by part, such as ``{actor: 0.1}``; 1 for a part that is not named.
         refit_normaliser: with ``init_from``, take the statistics of the new data, not the checkpoint's.
         watch: look every so many steps whether the critic left the range that rewards and discounts allow.
+        skill_hash: fingerprint of the skill model whose codes these are, linked from the data; null if nobody knows.
 
     Raises:
         UserError: a setting outside its range; the message names it.
@@ -98,6 +99,7 @@ class PolicyModule(StageModule):
         lr_scale: dict[str, float] | None = None,
         refit_normaliser: bool = False,
         watch: int = 500,
+        skill_hash: str | None = None,
     ) -> None:
         super().__init__()
         hidden_dims = list(hidden_dims)

@@ -15,7 +15,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +28,7 @@ from torch import Tensor, nn
 
 import dds_lightning
 from dds_lightning.errors import UserError
-from dds_lightning.files import beside, neighbours, sha256, sync
+from dds_lightning.files import folder_written_whole, mend_folder, neighbours, refuse_newer, sha256
 
 FORMAT_VERSION = 1
 WEIGHTS, CONFIG, METRICS, CARD, SUMS = (
@@ -96,8 +95,7 @@ def publish(
         OSError: it could not be written.
     """
     target = Path(directory).expanduser().resolve()
-    target.parent.mkdir(parents=True, exist_ok=True)
-    _finish_written_whole(target)
+    mend_folder(target)
     _refuse_foreign(target)
     entries: dict[str, Any] = {"format_version": FORMAT_VERSION, "dds_lightning": dds_lightning.__version__}
     entries |= _plain(dict(config or {}), CONFIG)
@@ -112,22 +110,17 @@ def publish(
         METRICS: json.dumps(_plain(dict(metrics or {}), METRICS), indent=2, allow_nan=True) + "\n",
         CARD: card if card is not None else _short_card(target.name, entries),
     }
-    part = beside(target)
-    part.mkdir()
-    try:
-        safetensors.torch.save_file(state, part / WEIGHTS, metadata={"format": "pt"})
+    with folder_written_whole(target) as part:
+        try:
+            safetensors.torch.save_file(state, part / WEIGHTS, metadata={"format": "pt"})
+        except safetensors.SafetensorError as error:  # its word for an error of the disk
+            raise UserError(f"{target / WEIGHTS} could not be written: {error}") from None
         (part / WEIGHTS).chmod(0o644)  # safetensors writes for the owner alone
         for name, text in texts.items():
             (part / name).write_text(text, encoding="utf-8")
         sums = "".join(f"{sha256(part / name)}  {name}\n" for name in CONTENTS)
         (part / SUMS).write_text(sums, encoding="utf-8")
-        for name in (*CONTENTS, SUMS):
-            sync(part / name)
-        sync(part)
         load_published(part)
-        _swap(part, target)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
     return Path(directory)
 
 
@@ -139,7 +132,7 @@ def load_published(directory: str | os.PathLike[str]) -> Published:
     """
     directory = Path(directory).expanduser()
     with contextlib.suppress(OSError):
-        _finish_written_whole(directory.resolve())
+        mend_folder(directory.resolve())
     if not directory.is_dir():
         raise UserError(f"there is no published checkpoint {directory}{neighbours(directory)}")
     there = sorted(entry.name for entry in directory.iterdir())
@@ -151,14 +144,7 @@ def load_published(directory: str | os.PathLike[str]) -> Published:
         )
     _verify_sums(directory)
     config = _read(directory / CONFIG, yaml.safe_load)
-    version = config.get("format_version")
-    if not isinstance(version, int) or version < 1:
-        raise UserError(f"{directory / CONFIG}: format_version is {version!r}, expected a number from 1 on")
-    if version > FORMAT_VERSION:
-        raise UserError(
-            f"{directory} has format {version}, but this version of dds-lightning reads up to "
-            f"{FORMAT_VERSION}: install a newer one"
-        )
+    refuse_newer(directory / CONFIG, config.get("format_version"), FORMAT_VERSION)
     try:
         state = safetensors.torch.load_file(directory / WEIGHTS)
     except (safetensors.SafetensorError, OSError, ValueError) as error:
@@ -202,34 +188,6 @@ def _refuse_foreign(target: Path) -> None:
     if foreign:
         names = ", ".join(foreign[:5]) + (" ..." if foreign[5:] else "")
         raise UserError(f"{target} holds what was not published: {names}; move it away or choose another directory")
-
-
-def _backup(target: Path) -> Path:
-    return target.with_name(f".{target.name}.previous")
-
-
-def _swap(part: Path, target: Path) -> None:
-    """Put a finished directory in its place. Killed in between, `_finish_replacing` mends it."""
-    backup = _backup(target)
-    if target.exists():
-        os.rename(target, backup)
-    try:
-        os.rename(part, target)
-    except OSError:
-        _finish_written_whole(target)
-        raise
-    sync(target.parent)
-    shutil.rmtree(backup, ignore_errors=True)
-
-
-def _finish_written_whole(target: Path) -> None:
-    """After a kill within `_swap`: the previous directory comes back, or goes if the new one is in place."""
-    backup = _backup(target)
-    if backup.is_dir():
-        if target.exists():
-            shutil.rmtree(backup, ignore_errors=True)
-        else:
-            os.rename(backup, target)
 
 
 def _plain(value: Any, where: str) -> Any:

@@ -29,7 +29,7 @@ from typing import Any
 from rich.console import Console
 
 from dds_lightning.errors import UserError
-from dds_lightning.files import sha256, written_whole
+from dds_lightning.files import refuse_newer, sha256, written_whole
 
 FORMAT = 1
 MARKER = "stage.json"
@@ -82,11 +82,14 @@ class Stages:
             reads: the stages whose outputs it uses.
             work: called with (folder, resuming); returns outputs (values that are paths in the folder) and
                 facts.
+
+        Raises:
+            UserError: a newer version of this package did the stage; nothing is touched.
         """
         folder = self.root / name
         expected = {"settings": _json(settings), "inputs": {stage.name: stage.digest for stage in reads}}
-        marker = _read(folder / MARKER)
-        same = {key: marker.get(key) for key in expected} == expected and marker.get("format") == FORMAT
+        marker = read_marker(folder)
+        same = {key: marker.get(key) for key in expected} == expected
         if same and marker.get("state") == "finished" and not self.fresh and (found := _found(folder, marker)):
             self._say(f"{title}: done before, in {duration(found.seconds)}", "dim")
             self.done.append(found)
@@ -174,12 +177,20 @@ def duration(seconds: float) -> str:
     return f"{minutes} min {rest} s" if minutes else f"{rest} s" if seconds >= 10 else f"{seconds:.1f} s"
 
 
-def _read(path: Path) -> dict[str, Any]:
+def read_marker(folder: Path) -> dict[str, Any]:
+    """The marker of a stage's folder; empty where there is none, or a damaged one.
+
+    Raises:
+        UserError: a newer version of this package wrote it.
+    """
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = json.loads((folder / MARKER).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
-    return value if isinstance(value, dict) else {}
+    if not isinstance(value, dict):
+        return {}
+    refuse_newer(folder / MARKER, value.get("format", FORMAT), FORMAT)
+    return value
 
 
 def _found(folder: Path, marker: dict[str, Any]) -> Done | None:

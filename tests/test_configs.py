@@ -120,8 +120,8 @@ def test_a_run_tells_the_command_that_makes_it_again():
     plain = RunSettings.with_preset("hopper-medium", Path("out"))
     assert plain.command() == "dds run hopper-medium --seed=0"
     asked = RunSettings.with_preset(
-        "hopper-medium", Path("out"), seed=3, data_steps=5000, noise_scale=0.5, policy=("--model.alpha=10",)
+        "hopper-medium", Path("out"), seed=3, data_steps=5000, noise_scale=0.25, policy=("--model.alpha=10",)
     )
     assert asked.command() == (
-        "dds run hopper-medium --seed=3 --data_steps=5000 --noise_scale=0.5 --policy.model.alpha=10"
+        "dds run hopper-medium --seed=3 --data_steps=5000 --noise_scale=0.25 --policy.model.alpha=10"
     )

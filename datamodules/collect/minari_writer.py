@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import importlib.metadata
 import json
 import os
 import shutil
-import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -17,10 +17,13 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
-from datamodules.storage import put_in_place, refuse_existing, write_durably
+from datamodules.storage import refuse_existing
+from dds_lightning.files import folder_written_whole
 
 Episode = Mapping[str, Any]
 """Minari's field names (observations, actions, rewards, ..., infos) to arrays or mappings of arrays."""
+ROOM_TO_CLOSE = 4 << 20
+"""Bytes of a disk that stay free: for HDF5's own tables and what others write meanwhile."""
 
 
 def write_minari(
@@ -55,14 +58,12 @@ def write_minari(
 
     Raises:
         UserError: When the folder exists and `overwrite` is False.
+        OSError: When the disk is full; an earlier set of the name is still there.
     """
     folder = Path(root) / dataset_id
     refuse_existing(folder, overwrite)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", suffix=".partial", dir=folder.parent))
-    try:
-        partial.chmod(0o755)
-        data = partial / "data"
+    with folder_written_whole(folder) as part:
+        data = part / "data"
         data.mkdir()
         count, steps = _write_episodes(data / "main_data.hdf5", episodes)
         from minari.serialization import serialize_space
@@ -80,11 +81,8 @@ def write_minari(
             "dataset_size": round((data / "main_data.hdf5").stat().st_size / 1e6, 1),
             **metadata,
         }
-        write_durably(data / "metadata.json", json.dumps(facts, indent=1))
-        put_in_place(partial, folder, overwrite)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
+        (data / "metadata.json").write_text(json.dumps(facts, indent=1), encoding="utf-8")
+        refuse_existing(folder, overwrite)
     return folder
 
 
@@ -97,10 +95,20 @@ def _write_episodes(path: Path, episodes: Iterable[Episode]) -> tuple[int, int]:
             group.attrs["id"] = count - 1
             group.attrs["total_steps"] = length
             steps += length
+            _refuse_full_disk(path, episode)
             _write_fields(group, episode)
-    with path.open("rb+") as written:
-        os.fsync(written.fileno())
     return count, steps
+
+
+def _refuse_full_disk(path: Path, episode: Episode) -> None:
+    """Stop while there is room to close the file: where a write fails, HDF5 takes the whole process down."""
+    if shutil.disk_usage(path.parent).free < _size(episode) + ROOM_TO_CLOSE:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def _size(value: Any) -> int:
+    """Bytes of all arrays in it."""
+    return sum(map(_size, value.values())) if isinstance(value, Mapping) else np.asarray(value).nbytes
 
 
 def _write_fields(group: h5py.Group, fields: Mapping[str, Any]) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from datamodules.collect.behaviour import QUIET, BehaviourNoise, Driver
 from datamodules.collect.minari_writer import write_minari
-from datamodules.collect.recording import Episode, record
+from datamodules.collect.recording import Episode, Kept, record
 from datamodules.storage import refuse_existing
 from dds_lightning.envs.build import build_env, register_environments
 from dds_lightning.errors import UserError
@@ -45,12 +45,12 @@ def collect_pointmaze(
     A shortest path over the maze's cells gives waypoints, a velocity controller drives to them, and a new
     goal is drawn whenever one is reached. `diverse` tasks start and head anywhere, `play` tasks between
     hand-picked cells. Each episode is a function of (seed, its number), so the arrays are the same for any
-    number of workers.
+    number of workers. An interrupted call goes on where it stopped when it is made again.
 
     Args:
         task: A PointMaze task or its name.
         steps: Environment steps in all.
-        seed: Same seed, same bytes of every array.
+        seed: Same seed, same bytes of every array, whatever the workers and interruptions.
         out: Folder of data sets; the set becomes `out/<dataset_id>`, where MINARI_DATASETS_PATH=out finds it.
         workers: Processes; None takes every core, 1 stays in this process.
         episode_steps: Steps after which an episode is truncated (the last one may be shorter).
@@ -93,9 +93,11 @@ def collect_pointmaze(
     refuse_existing(Path(out) / name, overwrite)
 
     recorder = _Recorder(task, seed, steps, episode_steps, speed, noise)
-    episodes = record(recorder, workers, title=f"collecting {name}" if progress else None)
+    collection = {"task": task.name, "seed": seed, "steps": steps, "speed": speed, **vars(noise)}
+    kept = Kept(Path(out) / name, {**collection, "episode_steps": episode_steps})
+    episodes = record(recorder, workers, kept=kept, title=f"collecting {name}" if progress else None)
     env = recorder.env()
-    return write_minari(
+    folder = write_minari(
         out,
         name,
         episodes,
@@ -109,9 +111,11 @@ def collect_pointmaze(
             "description": _description(task, seed, speed, noise),
             "eval_env_spec": evaluation_spec(task).to_json(),
             "requirements": [f"{p}=={installed.version(p)}" for p in ("gymnasium-robotics", "mujoco")],
-            "collection": {"task": task.name, "seed": seed, "steps": steps, "speed": speed, **vars(noise)},
+            "collection": collection,
         },
     )
+    kept.remove()
+    return folder
 
 
 def collection_spec(task: Task, episode_steps: int) -> EnvSpec:

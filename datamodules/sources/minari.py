@@ -7,6 +7,7 @@ it than the task's observations need.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 from pathlib import Path
@@ -22,6 +23,7 @@ from datamodules.sources.observations import Layout, Part
 from datamodules.trajectories import Trajectories
 from datamodules.validation import FIELDS, DataError, validate_episode
 from dds_lightning.errors import UserError
+from dds_lightning.files import mend_folder
 from dds_lightning.tasks import Task
 
 Fields = dict[str, NDArray[Any]]
@@ -91,6 +93,8 @@ def load_local(directory: str, task: Task | None) -> Trajectories:
 def data_folder(directory: str | Path) -> Path:
     """Where `main_data.hdf5` and `metadata.json` of a data set's folder lie: in `data`, or in itself."""
     folder = Path(directory).expanduser()
+    with contextlib.suppress(OSError):
+        mend_folder(folder)
     return folder / "data" if (folder / "data").is_dir() else folder
 
 

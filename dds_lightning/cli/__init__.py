@@ -14,10 +14,13 @@ from contextlib import redirect_stdout
 from typing import Any
 
 from dds_lightning import __version__
-from dds_lightning.errors import UserError
+from dds_lightning.errors import UserError, is_out_of_memory, reason
+from dds_lightning.files import DISK_ERRORS
 from dds_lightning.training.interrupts import Interrupted, caught
 
 USAGE_ERROR = 2
+GOES_ON = ("run", "relabel", "data collect", "data fetch")
+"""Commands that find by themselves what an earlier call of theirs has done."""
 STAGES = {
     "skill": "Stage one by itself: fit, validate, test or predict with the skill model.",
     "policy": "Stage two by itself: fit, validate, test or predict with the policy.",
@@ -25,7 +28,7 @@ STAGES = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status: 0, 2 for a user's mistake, 128 + signal when interrupted.
+    """Run one command and return its exit status: 0, 2 for what the user can mend, 128 + signal when interrupted.
 
     Args:
         argv: the words after `dds`; None takes them from the process.
@@ -37,6 +40,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _dispatch(words)
     except UserError as error:
         return _complain(str(error))
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        return _complain(f"out of memory ({reason(error)}): ask for less at once, for example with fewer --workers")
     except Interrupted as stop:
         print(f"dds: {_interrupted(words, stop)}", file=sys.stderr)
         return int(stop.code or 1)
@@ -44,6 +51,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         # The reader has left (`dds tasks | head`); Python would complain again while closing standard output.
         sys.stdout = None
         return 0
+    except OSError as error:
+        if error.errno not in DISK_ERRORS:
+            raise
+        return _complain(f"{error.filename}: {error.strerror}" if error.filename else str(error.strerror))
 
 
 def _dispatch(words: list[str]) -> int:
@@ -122,10 +133,12 @@ def _complain(message: str) -> int:
 
 def _interrupted(words: list[str], stop: Interrupted) -> str:
     """What was saved and which command goes on."""
-    if words[:1] == ["run"]:
-        return f"interrupted; the same command goes on where it stopped:\n  {shlex.join(['dds', *words])}"
+    if " ".join(_path(words)) in GOES_ON:
+        again = [word for word in words if not word.startswith("--fresh")]  # or it would begin anew
+        return f"interrupted; the same command goes on where it stopped:\n  {shlex.join(['dds', *again])}"
     if stop.saved is None:
-        return "interrupted"
+        same = shlex.join(["dds", *words])
+        return f"interrupted before anything was saved; the same command begins again:\n  {same}"
     kept, skip = [], False
     starts = ("--ckpt_path", "--model.init_from")  # a training that goes on does not start from anything
     for word in words:

@@ -123,8 +123,7 @@ def relabel(
         reward_scale: factor on the learning reward; without it the task's
         reward_shift: shift of the learning reward; without it the task's
     """
-    from datamodules.relabel import relabel as relabel_data
-    from datamodules.relabel import relabel_key
+    from datamodules.relabel import Relabelled
     from datamodules.relabeled import RelabeledDataModule
 
     module = RelabeledDataModule(
@@ -138,8 +137,10 @@ def relabel(
         reward_shift=reward_shift,
     )
     path = Path(out) if out else module.cache_file()
-    made = relabel_data(module.trajectories, module.skill, **module.settings, progress=True)
-    made.save(path, relabel_key(module.trajectories, module.skill, **module.settings))
+    try:
+        made = Relabelled.load(path, module.key)  # done before
+    except UserError:
+        made = module.relabel_into(path)
     summary = made.summary()
     used = int((summary["segments"] > 0).sum()) if "segments" in summary else None
     return Report(

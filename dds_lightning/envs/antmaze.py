@@ -109,7 +109,7 @@ class D4RLAntMazeEnv(MujocoEnv, EzPickle):
 
     def _model_xml(self) -> str:
         """Gymnasium's ant with D4RL's constants, the maze's walls and a mark for the goal."""
-        root = ElementTree.parse(self.fullpath).getroot()
+        root = ElementTree.parse(self.fullpath).getroot()  # noqa: S314 - a file of the installed gymnasium
         self._find(root, "option").set("timestep", str(TIMESTEP))
         contacts = self._find(root, "default/geom")
         contacts.set("solref", SOLREF)

@@ -68,7 +68,7 @@ class _Remote:
         path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
         # One thread each: the workers themselves are the parallelism.
         environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-        self.process = subprocess.Popen(
+        self.process = subprocess.Popen(  # noqa: S603 - this Python and a constant program, no shell
             [sys.executable, "-P", "-c", _START_WORKER],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ import pandas as pd
 
 from dds_lightning.errors import UserError
 from dds_lightning.results import RolloutResult
+from dds_lightning.stages import read_marker
 from dds_lightning.study.tables import failures_table, skills_table, summary_table
 from dds_lightning.tasks import Task, get_task
 
@@ -49,7 +49,8 @@ class Findings:
         """Read a run directory.
 
         Raises:
-            UserError: it holds no evaluation, or one of a task that this version does not know.
+            UserError: it holds no evaluation, one of a task that this version does not know, or a stage of a newer
+                version.
         """
         if not (root / "evaluate" / "episodes.parquet").is_file():
             raise UserError(
@@ -78,7 +79,7 @@ class Findings:
                 episodes[episodes["actor"] == singles] if singles else None,
                 effects,
             ),
-            {stage: marker for stage in STAGES if (marker := _marker(root / stage / "stage.json"))},
+            {stage: marker for stage in STAGES if (marker := read_marker(root / stage))},
         )
 
     def facts(self, stage: str) -> Mapping[str, Any]:
@@ -89,7 +90,3 @@ class Findings:
     def protocol(self) -> Mapping[str, Any] | None:
         """How the evaluation was done, see `protocol.protocol`; None where an older version did it."""
         return self.facts("evaluate").get("protocol")
-
-
-def _marker(path: Path) -> dict[str, Any]:
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}

@@ -1,8 +1,8 @@
 """`dds skill` and `dds policy`: Lightning's command line over our modules, with its traps closed.
 
 - Dimensions come from the data (`data.observation_dim` -> `model.observation_dim`), never from the user.
-- `--ckpt_path` continues a training. The settings of the model come from the checkpoint; naming another value
-  for one of them is refused instead of being ignored.
+- `--ckpt_path` continues a training. The settings of the model, of the data and the seed come from the checkpoint;
+  naming another value for one of them is refused instead of being ignored.
 - A mistake in the data is found before the first file is written.
 """
 
@@ -22,17 +22,23 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from dds_lightning.checkpointing import load_ckpt
 from dds_lightning.configs import resolve_configs
-from dds_lightning.errors import UserError
+from dds_lightning.errors import UserError, is_out_of_memory, reason
+from dds_lightning.files import short
 from dds_lightning.reports import Report, table
 from dds_lightning.training import interrupts
-from dds_lightning.training.trainer import BestCheckpoint, RollingCheckpoint, trainer_settings
+from dds_lightning.training.trainer import BestCheckpoint, KeptSettings, RollingCheckpoint, trainer_settings
 
 DESCRIPTION = {
     "skill": "Stage one: learn discrete skills from segments of trajectories.",
     "policy": "Stage two: learn from relabelled data when to use which skill.",
 }
 STEPS = {"skill": 500_000, "policy": 1_500_000}  # the paper's, as are the defaults of the modules
-LINKS = {"skill": ("observation_dim", "action_dim", "horizon"), "policy": ("observation_dim", "num_skills")}
+LINKS = {
+    "skill": ("observation_dim", "action_dim", "horizon"),
+    "policy": ("observation_dim", "num_skills", "skill_hash"),
+}
+PLACES = ("data", "skill", "relabelled", "cache", "device_resident")
+"""Settings of the data that say where they are; a training may go on with them elsewhere."""
 
 
 def modules(stage: str) -> tuple[type[pl.LightningModule], type[pl.LightningDataModule]]:
@@ -106,7 +112,7 @@ class StageCLI(LightningCLI):
         self.config = parser.parse_args(args)
 
     def _parse_ckpt_path(self) -> None:
-        """Take the model's settings from the checkpoint, and refuse to contradict it."""
+        """Take what shaped the training from the checkpoint, and refuse to contradict it."""
         settings = self.config[self.config.subcommand]
         path = settings.get("ckpt_path")
         if path is None:
@@ -125,17 +131,20 @@ class StageCLI(LightningCLI):
                 )
             settings.model.init_from = None  # a file of settings says how the training began that goes on here
         self.checkpoint = load_checkpoint(path, self.stage)
-        trained = dict(self.checkpoint["hyper_parameters"])
-        chosen = self._chosen_model_settings()
+        linked = {f"model.{name}" for name in LINKS[self.stage]}
+        trained = {f"model.{name}": value for name, value in self.checkpoint["hyper_parameters"].items()}
+        if self.config.subcommand == "fit":  # one may look at a model with other data
+            trained |= self.checkpoint.get(KeptSettings.KEY, {})
+        chosen = self._chosen()
         for name, value in trained.items():
             if name in chosen and chosen[name] != value:
                 raise UserError(
-                    f"--model.{name} is {chosen[name]!r}, but checkpoint {path} was trained with {value!r}, "
-                    f"and --ckpt_path continues exactly that training: give --model.{name}={value}, or train "
+                    f"--{name} is {chosen[name]!r}, but checkpoint {path} was trained with {value!r}, "
+                    f"and --ckpt_path continues exactly that training: give --{name}={value}, or train "
                     "anew without --ckpt_path"
                 )
-            if name not in LINKS[self.stage] and name in settings.model:
-                settings.model[name] = value
+            if name not in linked and name in settings:
+                settings[name] = value
 
     def _take_shape(self, model: Namespace) -> None:
         """Take what shapes the network from the checkpoint to start from, save what the user wrote down."""
@@ -143,16 +152,15 @@ class StageCLI(LightningCLI):
 
         cls: Any = modules(self.stage)[0]
         assert issubclass(cls, StageModule)
-        trained, chosen = read(cls, model.init_from).hparams, self._chosen_model_settings()
+        trained, chosen = read(cls, model.init_from).hparams, self._chosen()
         for name in cls.SHAPE:
-            if name not in chosen and name not in LINKS[self.stage]:
+            if f"model.{name}" not in chosen and name not in LINKS[self.stage]:
                 model[name] = trained[name]
 
-    def _chosen_model_settings(self) -> dict[str, Any]:
-        """Settings of the model that the user wrote down, on the command line or in a file; no defaults."""
+    def _chosen(self) -> Namespace:
+        """Settings that the user wrote down, on the command line or in a file; no defaults."""
         given: Namespace = self.parser.parse_args(self.words, defaults=False)
-        model = given[self.config.subcommand].get("model") or Namespace()
-        return model.as_dict()
+        return given[self.config.subcommand]
 
     # ---------------------------------------------------------------- building
 
@@ -168,14 +176,28 @@ class StageCLI(LightningCLI):
         trained = (self.checkpoint or {}).get("hyper_parameters", {})
         path = self._get(self.config, "ckpt_path")
         for name in LINKS[self.stage]:
-            if name in trained and trained[name] != self.model.hparams[name]:
+            if trained.get(name) in (None, self.model.hparams[name]):
+                continue
+            if name == "skill_hash":
                 raise UserError(
-                    f"checkpoint {path} was trained with {name} {trained[name]}, the data have "
-                    f"{self.model.hparams[name]}: use a checkpoint and data of the same task"
+                    f"checkpoint {path} was trained on the codes of skill model {short(trained[name])}, data.skill "
+                    f"{self.datamodule.hparams.skill} is skill model {short(self.model.hparams[name])}: give the "
+                    "skill checkpoint that this policy learnt with"
                 )
+            raise UserError(
+                f"checkpoint {path} was trained with {name} {trained[name]}, the data have "
+                f"{self.model.hparams[name]}: use a checkpoint and data of the same task"
+            )
 
     def _instantiate_trainer(self, config: dict[str, Any], callbacks: list[pl.Callback]) -> pl.Trainer:
+        callbacks = [*callbacks, KeptSettings(self._settings_to_keep())]
         return super()._instantiate_trainer(trainer_settings(dict(config), callbacks), [])
+
+    def _settings_to_keep(self) -> dict[str, Any]:
+        """Seed and settings of the data: with the model's own, what a training cannot change on its way."""
+        settings = self.config[self.config.subcommand]
+        data = {f"data.{name}": value for name, value in settings.data.as_dict().items() if name not in PLACES}
+        return {"seed_everything": settings.seed_everything, **data}
 
     def _run_subcommand(self, subcommand: str) -> None:
         """Wait for `execute`."""
@@ -191,7 +213,27 @@ class StageCLI(LightningCLI):
         if self.subcommand == "fit" and self.checkpoint is None:
             self.model.refuse_frozen_without_weights()
         work: Callable[..., Report] = getattr(self, f"_{self.subcommand}")
-        return work(**self._prepare_subcommand_kwargs(str(self.subcommand)))
+        try:
+            return work(**self._prepare_subcommand_kwargs(str(self.subcommand)))
+        except (MemoryError, RuntimeError) as error:
+            if not is_out_of_memory(error):
+                raise
+            raise UserError(self._memory_advice(error)) from error
+
+    def _memory_advice(self, error: Exception) -> str:
+        """What to make smaller, and what is left."""
+        batch = self._get(self.config, "data.batch_size")
+        skill = self.stage == "skill"
+        horizon = self.model.hparams["horizon"] if skill else self.datamodule.skill.horizon
+        wider = "data.horizon or model.hidden_dim" if skill else "model.hidden_dims"
+        told = f"out of memory at step {self.trainer.global_step} with data.batch_size {batch} and horizon {horizon}"
+        saved = self._rolling.path if self._rolling else None
+        left = f"; {saved} is whole, and --model.init_from={saved} starts from it" if saved and saved.is_file() else ""
+        return f"{told} ({reason(error)}): lower data.batch_size first, then {wider}{left}"
+
+    @property
+    def _rolling(self) -> RollingCheckpoint | None:
+        return next((c for c in self.trainer.checkpoint_callbacks if isinstance(c, RollingCheckpoint)), None)
 
     def _fit(self, **kwargs: Any) -> Report:
         kwargs["weights_only"] = True
@@ -201,9 +243,7 @@ class StageCLI(LightningCLI):
         except SIGTERMException:  # before the first step; Lightning would end with status 0
             raise interrupts.Interrupted(signal.SIGTERM) from None
         saved = {
-            "checkpoint": next(
-                (c.path for c in self.trainer.checkpoint_callbacks if isinstance(c, RollingCheckpoint)), None
-            ),
+            "checkpoint": self._rolling.path if self._rolling else None,
             "best": next(
                 (c.best_model_path for c in self.trainer.checkpoint_callbacks if isinstance(c, BestCheckpoint)),
                 None,
@@ -213,7 +253,7 @@ class StageCLI(LightningCLI):
         data = {
             **saved,
             "steps": self.trainer.global_step,
-            "metrics": _numbers(self.trainer.callback_metrics),
+            "metrics": self._rolling.latest(self.trainer) if self._rolling else _numbers(self.trainer.callback_metrics),
             "logs": self.trainer.log_dir,
         }
         lines: list[Any] = [f"{self.trainer.global_step:,} steps; logs in {self.trainer.log_dir}"]

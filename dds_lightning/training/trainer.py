@@ -24,8 +24,9 @@ class RollingCheckpoint(Checkpoint):
     """Keep one file, `last.ckpt`, from which training goes on exactly where it stood.
 
     It is written after an optimiser step whenever `every_n_steps` steps or `every_n_seconds` seconds have
-    passed, at the end, and when SIGTERM or Ctrl-C asks to stop (then `Interrupted` follows). An error writes
-    nothing: the state that failed must not replace the last good one.
+    passed, at the end, and when SIGTERM or Ctrl-C asks to stop. What follows that step, its metrics and a validation
+    that is due, is still done; then `Interrupted` is raised. An error writes nothing: the state that failed must not
+    replace the last good one.
 
     Args:
         dirpath: folder of the file; null puts it beside the logs of this launch.
@@ -41,8 +42,10 @@ class RollingCheckpoint(Checkpoint):
         self.every_n_seconds = every_n_seconds
         self.every_n_steps = every_n_steps
         self.path: Path | None = None
+        self.metrics: dict[str, float] = {}
         self._saved_step = -1
         self._saved_time = time.monotonic()
+        self._unflushed = self._leaving = False
 
     def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
         """Settle where the file goes."""
@@ -57,33 +60,90 @@ class RollingCheckpoint(Checkpoint):
         self._saved_time = time.monotonic()
         self._saved_step = trainer.global_step
 
+    def on_train_batch_start(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, batch: Any, batch_idx: int
+    ) -> None:
+        """Everything that belongs to the step before is logged now: stop here if somebody asked to."""
+        if self._unflushed:
+            # A kill must not cost metrics of steps that are saved: nobody would do these steps again.
+            for logger in trainer.loggers:
+                logger.save()
+            self._unflushed = False
+        self._leave()
+
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Save when it is time, or when somebody asked to stop."""
         step = trainer.global_step
-        signum = interrupts.pending()
         by_time = self.every_n_seconds > 0 and time.monotonic() - self._saved_time >= self.every_n_seconds
-        stop = signum is not None
         if trainer.world_size > 1:
-            # Every process has to take part in a save, and their clocks and signals differ.
-            by_time = trainer.strategy.broadcast(by_time)
-            stop = trainer.strategy.reduce_boolean_decision(stop, all=False)
+            by_time = trainer.strategy.broadcast(by_time)  # every process takes part in a save, and clocks differ
         by_steps = self.every_n_steps > 0 and step % self.every_n_steps == 0
-        if stop or ((by_time or by_steps) and step != self._saved_step):
+        if self._asked_to_stop(trainer) or ((by_time or by_steps) and step != self._saved_step):
             self._save(trainer)
-        if stop:
-            raise interrupts.Interrupted(signum or interrupts.SIGNALS[0], str(self.path))
+
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Save again what was saved before this validation: on resuming, Lightning would leave it out."""
+        if trainer.state.fn != "fit" or trainer.sanity_checking:
+            return
+        if self._asked_to_stop(trainer) or self._saved_step == trainer.global_step:
+            self._save(trainer)
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Save the finished model."""
         if self._saved_step != trainer.global_step or not (self.path and self.path.exists()):
             self._save(trainer)
+        self._leave()
+
+    def state_dict(self) -> dict[str, Any]:
+        """The last value of every metric: a training that goes on may end before it measures some of them again."""
+        return {"metrics": self.metrics}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on from `state_dict`."""
+        self.metrics = state_dict.get("metrics", {})
+
+    def latest(self, trainer: pl.Trainer) -> dict[str, float]:
+        """The last value of every metric of this training, launches before this one included."""
+        return {**self.metrics, **{name: float(value) for name, value in trainer.callback_metrics.items()}}
+
+    def _asked_to_stop(self, trainer: pl.Trainer) -> bool:
+        asked = interrupts.pending() is not None
+        if trainer.world_size > 1:
+            asked = trainer.strategy.reduce_boolean_decision(asked, all=False)  # not all may have got the signal
+        self._leaving = self._leaving or asked
+        return asked
+
+    def _leave(self) -> None:
+        if self._leaving:
+            raise interrupts.Interrupted(interrupts.pending() or interrupts.SIGNALS[0], str(self.path))
 
     def _save(self, trainer: pl.Trainer) -> None:
         assert self.path is not None, "setup('fit') comes first"
+        self.metrics = self.latest(trainer)
         trainer.save_checkpoint(self.path)
-        self._saved_step, self._saved_time = trainer.global_step, time.monotonic()
+        self._saved_step, self._saved_time, self._unflushed = trainer.global_step, time.monotonic(), True
+
+
+class KeptSettings(Callback):
+    """Keep in every checkpoint how its training was asked for, so that a contradiction is noticed on resuming.
+
+    Args:
+        settings: dotted name -> plain value.
+    """
+
+    KEY = "settings"
+    """Entry of the checkpoint."""
+
+    def __init__(self, settings: dict[str, Any]) -> None:
+        self.settings = settings
+
+    def on_save_checkpoint(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Add them."""
+        checkpoint[self.KEY] = self.settings
 
 
 class BestCheckpoint(ModelCheckpoint):
@@ -105,7 +165,19 @@ class BestCheckpoint(ModelCheckpoint):
             save_top_k=1,
             enable_version_counter=False,
             every_n_train_steps=every_n_steps,
+            save_on_train_epoch_end=False,  # after the validation: `RollingCheckpoint` keeps what this one knows then
         )
+        self.every_n_steps = every_n_steps
+
+    def on_train_batch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Look right after the step: at an epoch's end Lightning waits for a validation, and keeps later weights."""
+        if not self.every_n_steps or trainer.global_step % self.every_n_steps:
+            return
+        candidates = self._monitor_candidates(trainer)
+        if self.monitor in candidates and not self._should_skip_saving_checkpoint(trainer):
+            self._save_topk_checkpoint(trainer, candidates)
 
 
 def loggers(root: str | Path) -> list[Logger]:
@@ -154,7 +226,8 @@ def trainer_settings(config: dict[str, Any], extra: list[Callback]) -> dict[str,
         isinstance(callback, ProgressBar) for callback in callbacks
     ):
         callbacks.append(StepProgress())
-    config["callbacks"] = callbacks
+    # Last of all: what others note at the same moment, the best score for example, belongs into its file.
+    config["callbacks"] = sorted(callbacks, key=lambda callback: isinstance(callback, RollingCheckpoint))
 
     plugins = config.get("plugins") or []
     plugins = list(plugins) if isinstance(plugins, list) else [plugins]

@@ -181,18 +181,30 @@ def test_flipped_bytes_of_the_data_are_noticed(large: Path, tmp_path: Path) -> N
             load_trajectories(f"local:{tmp_path}", LARGE)
 
 
-def test_an_interrupted_collection_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_collection_goes_on_and_ends_with_the_same_bytes(
+    large: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     record = pointmaze._Recorder.__call__
+    recorded = []
 
-    def stop(self: pointmaze._Recorder, number: int) -> dict[str, Any]:
-        if number == 2:
+    def stop(self: pointmaze._Recorder, number: int) -> list[dict[str, Any]]:
+        if number == 4 and 4 not in recorded:
+            recorded.append(4)
             raise KeyboardInterrupt
+        recorded.append(number)
         return record(self, number)
+
+    def collect() -> Path:
+        return collect_pointmaze(LARGE, 2_250, 7, tmp_path, workers=1, progress=False)
 
     monkeypatch.setattr(pointmaze._Recorder, "__call__", stop)
     with pytest.raises(KeyboardInterrupt):
-        collect_pointmaze(LARGE, 300, 0, tmp_path, workers=1, progress=False, episode_steps=100)
-    assert list(tmp_path.iterdir()) == []
+        collect()
+    assert [path.name for path in tmp_path.iterdir()] == [f".{large.name}.recording"]  # no set, and what was recorded
+    again = collect()
+    assert recorded == [0, 1, 2, 3, 4, 4]  # the first parcel was not recorded twice
+    assert (large / "data" / "main_data.hdf5").read_bytes() == (again / "data" / "main_data.hdf5").read_bytes()
+    assert [path.name for path in tmp_path.iterdir()] == [large.name]
 
 
 def _script(tmp_path: Path, body: str) -> Path:
@@ -201,7 +213,7 @@ def _script(tmp_path: Path, body: str) -> Path:
     return script
 
 
-def test_ctrl_c_with_many_processes_leaves_nothing(tmp_path: Path) -> None:
+def test_ctrl_c_with_many_processes_leaves_no_set(tmp_path: Path) -> None:
     out = tmp_path / "out"
     call = f"collect_pointmaze({LARGE!r}, 2_000_000, 0, {str(out)!r}, workers=2, progress=False)"
     script = _script(tmp_path, f"if __name__ == '__main__':\n    {call}")
@@ -220,7 +232,7 @@ def test_ctrl_c_with_many_processes_leaves_nothing(tmp_path: Path) -> None:
         time.sleep(0.05)
     os.killpg(process.pid, signal.SIGINT)
     assert process.wait(timeout=60) != 0
-    assert list(out.iterdir()) == []
+    assert [path.suffix for path in out.iterdir()] == [".recording"]  # for the next call; no set, no half of one
 
 
 def test_a_script_without_a_guard_is_told_so(tmp_path: Path) -> None:
@@ -232,7 +244,7 @@ def test_a_script_without_a_guard_is_told_so(tmp_path: Path) -> None:
     )
     assert run.returncode != 0
     assert "a script must call this under `if __name__ == '__main__':`" in run.stderr
-    assert list(out.iterdir()) == []
+    assert not list(out.glob("[!.]*"))
 
 
 def test_an_existing_set_is_kept_unless_overwriting(tmp_path: Path) -> None:

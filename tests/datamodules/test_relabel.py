@@ -1,10 +1,14 @@
 """Relabelling: rewards and ends worked out by hand, the cache refused when it does not match."""
 
+import json
+
 import numpy as np
 import pandas as pd
 import pytest
 import torch
+from safetensors.torch import save_file
 
+import datamodules.relabel as relabelling
 from datamodules.relabel import Relabelled, relabel, relabel_key
 from datamodules.relabeled import RelabeledDataModule
 from datamodules.trajectories import Trajectories
@@ -113,6 +117,47 @@ def test_a_file_that_is_something_else_is_refused(tmp_path, content):
     path.write_bytes(content)
     with pytest.raises(UserError, match="no readable relabelled file"):
         Relabelled.load(path)
+
+
+def _stored(trajectories, skill):
+    made = relabel(trajectories, skill)
+    return {name: getattr(made, name).clone() for name in relabelling._STORED}
+
+
+ABOUT = {"format": 1, "num_skills": 4, "key": {"data": "d"}}
+DAMAGES = {
+    "no metadata": (lambda tensors, about: about.clear(), "KeyError"),
+    "no number": (lambda tensors, about: about.update(num_skills="four"), "ValueError"),
+    "a tensor too few": (lambda tensors, about: tensors.pop("dones"), "expected observations, codes"),
+    "a tensor too many": (lambda tensors, about: tensors.update(more=torch.zeros(1)), "it holds .*more"),
+    "a row too few": (lambda tensors, about: tensors.update(rewards=torch.zeros(9)), r"rewards has shape \(9,\)"),
+    "another type": (lambda tensors, about: tensors.update(codes=torch.zeros(10)), "codes is of type torch.float32"),
+    "a code too high": (lambda tensors, about: tensors["codes"].fill_(4), "codes run from 4 to 4, expected 0 to 3"),
+    "a negative code": (lambda tensors, about: tensors["codes"].fill_(-1), "codes run from -1"),
+    "a reward that is none": (lambda tensors, about: tensors["rewards"].fill_(torch.nan), "rewards holds numbers"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_file_is_refused_in_a_sentence(trajectories, skill, tmp_path, damage):
+    tensors, about = _stored(trajectories, skill), {**ABOUT}
+    save_file(tensors, tmp_path / "sound.safetensors", metadata={"about": json.dumps(about)})
+    assert len(Relabelled.load(tmp_path / "sound.safetensors")) == 10
+    change, message = DAMAGES[damage]
+    change(tensors, about)
+    save_file(tensors, tmp_path / "r.safetensors", metadata={"about": json.dumps(about)})
+    with pytest.raises(UserError, match=rf"r\.safetensors is no readable relabelled file .*{message}"):
+        Relabelled.load(tmp_path / "r.safetensors")
+
+
+def test_the_same_transitions_are_the_same_bytes_and_files_of_before_are_read(trajectories, skill, tmp_path):
+    """Its story: three entries of metadata came in any order, so that every relabelling counted as another one."""
+    for name in "abcdef":
+        relabel(trajectories, skill).save(tmp_path / name, {"data": "d", "gamma": 0.9})
+    assert len({(tmp_path / name).read_bytes() for name in "abcdef"}) == 1
+    before = {"format": "1", "num_skills": "4", "key": json.dumps({"data": "d", "gamma": 0.9})}
+    save_file(_stored(trajectories, skill), tmp_path / "before", metadata=before)
+    assert Relabelled.load(tmp_path / "before", {"data": "d", "gamma": 0.9}).num_skills == 4
 
 
 def test_a_missing_file_says_how_to_make_one(tmp_path):

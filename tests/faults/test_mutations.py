@@ -7,6 +7,7 @@ import json
 import os
 import pickle
 import random
+import re
 import shutil
 import struct
 import zipfile
@@ -282,3 +283,14 @@ def test_members_with_path_names_in_a_checkpoint_write_nothing(checkpoint, tmp_p
     with contextlib.suppress(UserError):
         SkillModule.load(tmp_path / "paths.ckpt")
     assert not (tmp_path.parent / "outside").exists()
+
+
+def test_the_package_unpickles_nothing_that_comes_from_outside():
+    """Only the environments' workers do, what their own caller sent them through a private pipe."""
+    unsafe = re.compile(
+        r"pickle\.loads?\(|allow_pickle=True|weights_only=False|torch\.jit\.load|yaml\.(unsafe_)?load\("
+    )
+    root = Path(__file__).parents[2]
+    sources = [path for package in ("dds_lightning", "datamodules") for path in (root / package).rglob("*.py")]
+    found = {str(path.relative_to(root)) for path in sources if unsafe.search(path.read_text(encoding="utf-8"))}
+    assert found == {"dds_lightning/envs/worker.py"}

@@ -61,7 +61,7 @@ def test_a_checkpoint_is_written_every_so_many_steps_and_seconds(monkeypatch):
     saved = []
     monkeypatch.setattr(pl.Trainer, "save_checkpoint", lambda self, path, **k: saved.append(self.global_step))
     fit([RollingCheckpoint("here", every_n_seconds=0, every_n_steps=3)])
-    assert saved == [3, 6, 9, 10]
+    assert saved == [3, 6, 6, 9, 10]  # a validation follows step 6, and what it found belongs into the file
     saved.clear()
     now = iter(range(1000))
     monkeypatch.setattr(training.time, "monotonic", lambda: next(now))
@@ -150,3 +150,18 @@ def test_a_log_file_gets_plain_lines_with_steps_time_left_and_the_loss():
     assert lines[-1].startswith("  step 10, 0.0 s left")
     assert "loss " in lines[-1]
     assert "\x1b" not in said.getvalue()
+
+
+class Scores(pl.Callback):
+    """A score after every fifth step, which is an epoch's end as well; the first is the best."""
+
+    def on_train_batch_end(self, trainer, pl_module, *_):
+        if trainer.global_step % 5 == 0:
+            pl_module.log("score", float(-trainer.global_step), on_step=True, on_epoch=False)
+
+
+def test_the_best_checkpoint_is_of_the_step_that_was_scored_also_at_an_epochs_end():
+    """Its story: where the next validation was steps away, Lightning kept the weights of that later step."""
+    base = {"limit_train_batches": 5, "check_val_every_n_epoch": None, "val_check_interval": 3}
+    fit([RollingCheckpoint("here"), BestCheckpoint("score", every_n_steps=5), Scores()], **base)
+    assert step_of("here/best.ckpt") == 5
