@@ -21,11 +21,13 @@ from datamodules.segments import SegmentDataModule
 from datamodules.trajectories import DataError
 from dds_lightning import DDSAgent, run_settings, tasks
 from dds_lightning.cli import main
+from dds_lightning.configs import run_defaults
 from dds_lightning.interpret import clip
 from dds_lightning.policy import PolicyModule
 from dds_lightning.rollout import Contestant, rollout
 from dds_lightning.skill import SkillModule
 from dds_lightning.study import report
+from dds_lightning.study.contestants import way_name
 from dds_lightning.tasks import get_task, task_names
 from tests.minari_recordings import write_minari_set
 from tests.recordings import record, write_d4rl_file
@@ -39,7 +41,8 @@ TINY += [f"--{stage}.{word}" for stage in ("skill", "policy") for word in (
     "trainer.val_check_interval=10", "trainer.log_every_n_steps=10",
 )]  # fmt: skip
 TINY += ["--skill.model.num_skills=2", "--skill.model.hidden_dim=16", "--skill.model.skill_dim=8"]
-TINY += ["--skill.model.encoder_layers=1", "--skill.model.decoder_blocks=1", "--policy.model.hidden_dims=[16]"]
+TINY += ["--skill.model.encoder_layers=1", "--skill.model.encoder_heads=2", "--skill.model.decoder_blocks=1"]
+TINY += ["--policy.model.hidden_dims=[16]"]
 
 
 @pytest.fixture(autouse=True)
@@ -101,9 +104,16 @@ def test_a_whole_run_from_a_published_layout_to_the_report(name, layout, variant
     told = capfd.readouterr().err
     assert (f"evaluating in {variant} ({env_id})" in told) == (layout == "minari")
 
-    how = said["protocol"]
+    how, preset = said["protocol"], run_defaults(task.family)
+    noise = preset["noise_scale"] or 1.0
     assert (how["task"], how["environment"], how["checkpoint"]) == (variant, env_id, "last")
-    assert (how["episodes"], how["seed"], how["noise_scale"], how["sampler"], how["horizon"]) == (2, 1, 1.0, "ddpm", 10)
+    assert (how["episodes"], how["seed"], how["noise_scale"], how["sampler"], how["horizon"]) == (
+        2,
+        1,
+        noise,
+        "ddpm",
+        10,
+    )
     assert (how["score_min"], how["score_max"]) == (task.score_min, task.score_max)
     assert how["paper_score"] == task.paper_score
     assert how["best"]["monitor"] == "rollout/score"
@@ -113,7 +123,7 @@ def test_a_whole_run_from_a_published_layout_to_the_report(name, layout, variant
     label = f"(best of 4 evaluations while training, step {how['best']['step']}: optimistic)"
     assert f"AWR policy, sampled {label}" in rows
     assert f"AWR policy, greedy {label}" in rows
-    assert next(iter(rows)) == said["main"] == "AWR policy, sampled"
+    assert next(iter(rows)) == said["main"] == way_name(preset["selection"])
     assert "behaviour cloning" in rows
     main_row = rows[said["main"]]
     expected = task.normalised_score(main_row["return"])
@@ -128,7 +138,7 @@ def test_a_whole_run_from_a_published_layout_to_the_report(name, layout, variant
         assert ("success" in text) == (task.maze_map is not None or "(median, successes)" in text)
         assert "The paper reports" in text
         assert "scripted controller" not in text
-    assert f"{variant} ({env_id}): 2 episodes each, seed 1, last checkpoint, decoder noise 1 (ddpm)" in page
+    assert f"{variant} ({env_id}): 2 episodes each, seed 1, last checkpoint, decoder noise {noise:g} (ddpm)" in page
     pictures = {path.name for path in (tmp_path / "run" / "report").glob("*.png")}
     maze = {"trajectories.png", "failed_ends.png", "values.png"}
     assert pictures & {*maze, "scores.png"} == (maze if task.maze_map is not None else {"scores.png"})
