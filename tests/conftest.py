@@ -1,7 +1,9 @@
 """What every test starts from: no network, no home directory of the user's, one thread, no window."""
 
+import json
 import os
 import socket
+from typing import Any, NamedTuple
 
 # Before numpy and torch are imported: several test processes share the cores.
 for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -42,3 +44,28 @@ def _isolated_process(tmp_path_factory):
 def _clean_working_directory(tmp_path, monkeypatch):
     """Start each test in an empty folder of its own: what a command writes by default lands there."""
     monkeypatch.chdir(tmp_path)
+
+
+class Answer(NamedTuple):
+    """What a command said."""
+
+    status: int
+    out: str
+    err: str
+
+    @property
+    def json(self) -> Any:
+        assert self.status == 0, self.err
+        return json.loads(self.out)
+
+
+@pytest.fixture
+def dds(capsys):
+    """Call `dds` with words in this process."""
+    from dds_lightning.cli import main
+
+    def call(*words):
+        capsys.readouterr()
+        return Answer(main([str(word) for word in words]), *capsys.readouterr())
+
+    return call

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import shlex
+from pathlib import Path
 
 from dds_lightning.cli import main
 
@@ -24,6 +25,13 @@ def of_data(root) -> list[str]:
     """Words for 2,000 steps of the smallest maze, collected into a folder."""
     assert call("data", "collect", TASK, "--steps", 2000, "--out", root, "--workers", 1) == 0
     return [f"--data.task={TASK}", f"--data.data=local:{root}/{TASK}-v0", "--data.validation_fraction=0.2"]
+
+
+def skill_of(data, out: Path, steps: int, *words: str) -> Path:
+    """Checkpoint of a skill model trained for some steps in the folder `out`."""
+    fit = ["skill", "fit", *data, *QUIET, *SKILL, f"--trainer.max_steps={steps}", *words]
+    assert call(*fit, f"--checkpoint.dirpath={out}", f"--trainer.default_root_dir={out}") == 0
+    return out / "last.ckpt"
 
 
 def told(err: str) -> str:

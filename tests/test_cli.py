@@ -1,7 +1,6 @@
 """The command line in-process: what it prints where, its exit status, and that mistakes write nothing."""
 
 import contextlib
-import json
 import os
 import signal
 import subprocess
@@ -25,29 +24,6 @@ TINY = ["--model.hidden_dim=16", "--model.skill_dim=8", "--model.encoder_layers=
 TINY += ["--model.decoder_blocks=1", "--data.batch_size=32", "--data.horizon=5", "--model.num_skills=4"]
 QUIET = ["--trainer.enable_progress_bar=false", "--trainer.enable_model_summary=false"]
 QUIET += ["--trainer.accelerator=cpu", "--trainer.limit_val_batches=1", "--trainer.num_sanity_val_steps=0"]
-
-
-class Answer:
-    """What a command said."""
-
-    def __init__(self, status, out, err):
-        self.status, self.out, self.err = status, out, err
-
-    @property
-    def json(self):
-        assert self.status == 0, self.err
-        return json.loads(self.out)
-
-
-@pytest.fixture
-def dds(capsys):
-    def call(*words):
-        capsys.readouterr()
-        status = main([str(word) for word in words])
-        out, err = capsys.readouterr()
-        return Answer(status, out, err)
-
-    return call
 
 
 def refused(answer, *parts):

@@ -8,24 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from dds_lightning.cli import main
 from dds_lightning.interpret import atlas_pictures
 from dds_lightning.study import atlas
 from dds_lightning.tasks import get_task
 from tests.interpret.tiny import recorded, tiny_agent, tiny_skill
 
 TASK = get_task("pointmaze-umaze-diverse")
-
-
-@pytest.fixture
-def dds(capsys):
-    def call(*words):
-        capsys.readouterr()
-        status = main([str(word) for word in words])
-        out, err = capsys.readouterr()
-        return status, out, err
-
-    return call
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -10,22 +10,10 @@ import pytest
 import torch
 
 from dds_lightning import DDSAgent
-from dds_lightning.cli import main
 from dds_lightning.skill import SkillModule
 from tests.test_hub import FolderHub
 
 SHIPPED = Path(__file__).parents[1] / "checkpoints" / "pointmaze-large"
-
-
-@pytest.fixture
-def dds(capsys):
-    def call(*words):
-        capsys.readouterr()
-        status = main([str(word) for word in words])
-        out, err = capsys.readouterr()
-        return status, out, err
-
-    return call
 
 
 def refused(answer, *parts):

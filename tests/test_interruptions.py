@@ -11,7 +11,7 @@ from datamodules.relabel import relabel
 from datamodules.segments import SegmentDataModule
 from dds_lightning.policy import PolicyModule
 from dds_lightning.skill import SkillModule
-from tests.fits import POLICY, QUIET, SKILL, TASK, call, of_data, resuming_words
+from tests.fits import POLICY, QUIET, SKILL, TASK, call, of_data, resuming_words, skill_of
 
 STATUS = {signal.SIGINT: 130, signal.SIGTERM: 143}
 SIGNALS = pytest.mark.parametrize("signum", STATUS, ids=lambda signum: signum.name)
@@ -24,10 +24,7 @@ def data(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def skill(data, tmp_path_factory):
-    out = tmp_path_factory.mktemp("skill")
-    words = ["skill", "fit", *data, *QUIET, *SKILL, "--trainer.max_steps=2", f"--checkpoint.dirpath={out}"]
-    assert call(*words, f"--trainer.default_root_dir={out}") == 0
-    return out / "last.ckpt"
+    return skill_of(data, tmp_path_factory.mktemp("skill"), 2)
 
 
 def interrupt(monkeypatch, owner, name, signum, call_number):

@@ -12,7 +12,7 @@ from dds_lightning.errors import UserError
 from dds_lightning.policy import PolicyModule
 from dds_lightning.publishing import CONTENTS, SUMS, publish
 from dds_lightning.skill import SkillModule
-from tests.fits import POLICY, QUIET, SKILL, call, of_data, told
+from tests.fits import POLICY, QUIET, SKILL, call, of_data, skill_of, told
 
 
 @pytest.fixture(scope="module")
@@ -26,8 +26,7 @@ def made(data, tmp_path_factory):
     out = tmp_path_factory.mktemp("made")
     words = [*data, *QUIET, "--trainer.max_steps=4", f"--trainer.default_root_dir={out}"]
     for name, seed in (("skill", 0), ("other", 1)):
-        fit = ["skill", "fit", *words, *SKILL, f"--checkpoint.dirpath={out / name}", f"--seed_everything={seed}"]
-        assert call(*fit) == 0
+        skill_of(data, out / name, 4, f"--seed_everything={seed}")
     fit = ["policy", "fit", *words, *POLICY, f"--data.skill={out}/skill/last.ckpt", "--data.gamma=0.9"]
     assert call(*fit, f"--checkpoint.dirpath={out}/policy") == 0
     return out

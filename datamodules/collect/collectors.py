@@ -74,31 +74,28 @@ def collect(
     """
     task = get_task(task) if isinstance(task, str) else task
     refuse_uncollectable(task)
-    module_name, name, recipe_class = COLLECTORS[task.family, task.physics]
-    module = importlib.import_module(module_name)
-    collector: Callable[..., Path] = getattr(module, name)
-    options = _options(task, collector, getattr(module, recipe_class) if recipe_class else None, recipe or {})
-    return collector(task, steps, seed, out, workers, **options, dataset_id=dataset_id, overwrite=overwrite)
-
-
-def _options(
-    task: Task, collector: Callable[..., Path], recipe_class: Any, recipe: Mapping[str, Any]
-) -> dict[str, Any]:
-    """The collector's keywords that stand for a recipe."""
-    if not recipe:
-        return {}
-    if recipe_class:
-        known = [field.name for field in fields(recipe_class)]
-    else:
-        every = inspect.signature(collector).parameters.values()
-        about_the_set = ("dataset_id", "overwrite", "progress")
-        known = [p.name for p in every if p.kind is p.KEYWORD_ONLY and p.name not in about_the_set]
-    for name, value in recipe.items():
+    collector, recipe_class, known = _collector(task)
+    for name, value in (recipe or {}).items():
         if name not in known:
             raise UserError(f"recipe.{name}: '{task.name}' has no such setting; it has {', '.join(known)}")
         if not isinstance(value, bool | int | float):
             raise UserError(f"recipe.{name}: found {value!r}, expected a number, true or false")
-    return {"recipe": recipe_class(**recipe)} if recipe_class else dict(recipe)
+    options = dict(recipe or {})
+    if recipe and recipe_class:
+        options = {"recipe": recipe_class(**recipe)}
+    return collector(task, steps, seed, out, workers, **options, dataset_id=dataset_id, overwrite=overwrite)
+
+
+def _collector(task: Task) -> tuple[Callable[..., Path], Any, dict[str, Any]]:
+    """A task's collector, the class of its recipe or None, and the settings of its behaviour with their defaults."""
+    module_name, name, recipe_name = COLLECTORS[task.family, task.physics]
+    module = importlib.import_module(module_name)
+    collector, recipe_class = getattr(module, name), getattr(module, recipe_name) if recipe_name else None
+    if recipe_class:
+        return collector, recipe_class, {field.name: field.default for field in fields(recipe_class)}
+    about_the_set = ("dataset_id", "overwrite", "progress")
+    keywords = [p for p in inspect.signature(collector).parameters.values() if p.kind is p.KEYWORD_ONLY]
+    return collector, None, {p.name: p.default for p in keywords if p.name not in about_the_set}
 
 
 def collection_command(folder: str | Path) -> str | None:
@@ -110,13 +107,12 @@ def collection_command(folder: str | Path) -> str | None:
     try:
         told = json.loads((Path(folder) / "data" / "metadata.json").read_text(encoding="utf-8"))["collection"]
         task, steps, seed = get_task(told["task"]), int(told["steps"]), int(told["seed"])
-        module, _, recipe_class = COLLECTORS[task.family, task.physics]
+        _, _, settings = _collector(task)
     except (OSError, ValueError, KeyError, TypeError, UserError):
         return None
     words = ["dds", "data", "collect", task.name, f"--steps={steps}", f"--seed={seed}"]
-    if recipe_class:
-        for field in fields(getattr(importlib.import_module(module), recipe_class)):
-            value = told.get(field.name, field.default)
-            if value != field.default and isinstance(value, bool | int | float):
-                words.append(f"--recipe.{field.name}={value}")
+    for name, default in settings.items():
+        value = told.get(name, default)
+        if value != default and isinstance(value, bool | int | float):
+            words.append(f"--recipe.{name}={value}")
     return shlex.join(words)

@@ -93,8 +93,9 @@ def collect_pointmaze(
     refuse_existing(Path(out) / name, overwrite)
 
     recorder = _Recorder(task, seed, steps, episode_steps, speed, noise)
-    collection = {"task": task.name, "seed": seed, "steps": steps, "speed": speed, **vars(noise)}
-    kept = Kept(Path(out) / name, {**collection, "episode_steps": episode_steps})
+    drive = {"episode_steps": episode_steps, "speed": speed, **vars(noise)}
+    collection = {"task": task.name, "seed": seed, "steps": steps, **drive}
+    kept = Kept(Path(out) / name, collection)
     episodes = record(recorder, workers, kept=kept, title=f"collecting {name}" if progress else None)
     env = recorder.env()
     folder = write_minari(

@@ -123,7 +123,7 @@ def collect(
 ) -> Report:
     """Make a data set by driving the task's environment, on all cores.
 
-    Call it again after an interruption and it goes on where it stopped (PointMaze, which takes seconds, begins anew).
+    Call it again after an interruption and it goes on where it stopped.
 
     Args:
         task: name of a task; `dds tasks` lists them

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from dds_lightning.agent import DDSAgent
 from dds_lightning.errors import UserError
@@ -17,6 +15,7 @@ from dds_lightning.interpret.atlas_pictures import Tell
 from dds_lightning.results import RolloutResult
 from dds_lightning.rollout import rollout, single_skills
 from dds_lightning.skill import SkillModule
+from dds_lightning.stages import read_marker
 from dds_lightning.study.contestants import agent_directory, way
 from dds_lightning.study.findings import Findings
 from dds_lightning.tasks import Task, get_task
@@ -58,7 +57,7 @@ def find_subject(place: Path, seed: int = 0) -> Subject:
     data, task = _data_of(place)
     if not (place / "model.safetensors").is_file() and not (place / "agent" / "model.safetensors").is_file():
         checkpoint = place / "skill" / "last.ckpt"
-        if _marker(place / "skill").get("state") == "finished" and checkpoint.is_file():
+        if read_marker(place / "skill").get("state") == "finished" and checkpoint.is_file():
             return Subject(
                 _skills_alone(checkpoint, seed), task, data, None, f"skills of the run {place}, no policy yet"
             )
@@ -78,14 +77,9 @@ def _skills_alone(checkpoint: Path, seed: int) -> DDSAgent:
     return DDSAgent(SkillModule.load(checkpoint), None, "random", seed=seed)
 
 
-def _marker(folder: Path) -> dict[str, Any]:
-    path = folder / "stage.json"
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-
-
 def _data_of(run: Path) -> tuple[str | None, str | None]:
     """Data and task of a run; nothing of what is no run."""
-    marker = _marker(run / "data")
+    marker = read_marker(run / "data")
     settings = marker.get("settings", {})
     collected = marker.get("outputs", {}).get("data")
     return settings.get("data") or (f"local:{run / 'data' / collected}" if collected else None), settings.get("task")

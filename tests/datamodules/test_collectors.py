@@ -102,6 +102,10 @@ def test_a_collected_set_tells_the_command_that_makes_it_again(tmp_path):
     assert collection_command(folder) == (
         "dds data collect hopper-medium --steps=40 --seed=3 --recipe.action_noise=0.06"
     )
+    point = collect("pointmaze-umaze-diverse", 40, out=tmp_path, workers=1, recipe={"speed": 3, "episode_steps": 20})
+    assert collection_command(point) == (
+        "dds data collect pointmaze-umaze-diverse --steps=40 --seed=0 --recipe.episode_steps=20 --recipe.speed=3"
+    )
     (folder / "data" / "metadata.json").write_text('{"collection": {"task": "mine"}}')
     assert collection_command(folder) is None
     assert collection_command(tmp_path) is None

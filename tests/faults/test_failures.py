@@ -19,7 +19,7 @@ from dds_lightning.errors import UserError, is_out_of_memory
 from dds_lightning.policy import PolicyModule
 from dds_lightning.publishing import load_published
 from dds_lightning.skill import SkillModule
-from tests.fits import POLICY, QUIET, SKILL, TASK, call, of_data, told
+from tests.fits import POLICY, QUIET, SKILL, TASK, call, of_data, skill_of, told
 
 
 @pytest.fixture(scope="module")
@@ -29,10 +29,7 @@ def data(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def skill(data, tmp_path_factory):
-    out = tmp_path_factory.mktemp("skill")
-    words = ["skill", "fit", *data, *QUIET, *SKILL, "--trainer.max_steps=3", f"--checkpoint.dirpath={out}"]
-    assert call(*words, f"--trainer.default_root_dir={out}") == 0
-    return out / "last.ckpt"
+    return skill_of(data, tmp_path_factory.mktemp("skill"), 3)
 
 
 SAVING = ["--checkpoint.dirpath=out", "--checkpoint.every_n_steps=2", "--trainer.max_steps=50"]
