@@ -109,6 +109,34 @@ def test_the_policy_steps_right_everywhere_however_it_is_chosen(trained):
     assert many.max() == 1  # codes 2 and 3 are not in the data
 
 
+def test_the_closed_form_is_what_the_regression_tends_to(trained):
+    regressed, chain = trained
+    states = torch.eye(5)[:4]
+    settings = {"observation_dim": 5, "alpha": 10.0, "awr": "closed_form", "lr": 3e-3, "critic_steps": 0}
+    module = small(**settings, extraction="after")
+    module.load_state_dict(
+        {**regressed.state_dict(), **{f"actor.{k}": v for k, v in module.actor.state_dict().items()}}
+    )
+    fit(module, 400, chain)
+    with torch.no_grad():
+        expected, found = (m.logits(states).softmax(dim=-1) for m in (regressed, module.eval()))
+        module.hparams.alpha = 0.0
+        data = module.logits(states).softmax(dim=-1)
+    assert found[:, :2] == pytest.approx(expected[:, :2], abs=0.05)
+    assert (found[:, 2:] == 0).all()  # codes 2 and 3 are not in the data
+    assert data[:, :2] == pytest.approx(torch.full((4, 2), 0.5), abs=0.02)  # with alpha 0 the policy of the data
+
+
+def test_the_closed_form_leaves_out_what_the_data_hardly_do_there():
+    module = small(awr="closed_form", alpha=1.0, beta_floor=0.1)
+    with torch.no_grad():
+        module.actor[-1].weight.zero_()
+        module.actor[-1].bias.copy_(torch.tensor([0.55, 0.35, 0.09, 0.01]).log())
+        probabilities = module.logits(torch.randn(50, 2)).softmax(dim=-1)
+    assert (probabilities[:, :2] > 0).all()
+    assert (probabilities[:, 2:] == 0).all()
+
+
 def test_codes_without_support_are_never_chosen():
     module = small()
     module.support_mask.copy_(torch.tensor([True, False, True, False]))
