@@ -63,7 +63,10 @@ def run_defaults(name: str) -> dict[str, Any]:
         UserError: there is no such preset, or its `run.yaml` holds something else.
     """
     path = _preset_folder(name) / "run.yaml"
-    chosen = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    try:
+        chosen = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise UserError(f"preset: {path} is no YAML: {' '.join(str(error).split())}") from error
     known = ", ".join(RUN_DEFAULTS)
     if not isinstance(chosen, dict):
         raise UserError(f"preset: {path} holds no settings, expected some of {known}")
