@@ -8,7 +8,7 @@ BIN    := $(VENV)/bin
 PYTEST_ARGS ?= -n auto --dist loadscope -m 'not faults'
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test faults lint format audit notebooks notebooks-env clean
+.PHONY: help demo test faults lint format audit figures notebooks notebooks-env clean
 
 help:  ## show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */\1|/' | awk -F'|' '{printf "  make %-14s %s\n", $$1, $$2}'
@@ -48,8 +48,11 @@ audit: $(VENV)/.installed  ## look every pinned version up among known vulnerabi
 	$(BIN)/python -m pip install --quiet 'pip-audit>=2.7' --constraint constraints.txt
 	$(BIN)/pip-audit --requirement constraints.txt --no-deps --disable-pip --strict --progress-spinner off
 
-notebooks: $(VENV)/.notebooks  ## execute all notebooks anew, about five minutes
+notebooks: $(VENV)/.notebooks  ## execute all ten notebooks anew, under 45 minutes
 	$(BIN)/python notebooks/execute.py
+
+figures: $(VENV)/.installed  ## draw the figures of all shipped checkpoints anew
+	$(BIN)/python benchmarks/draw_figures.py
 
 notebooks-env: $(VENV)/.notebooks  ## add Jupyter to the environment
 

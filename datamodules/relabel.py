@@ -20,6 +20,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 import torch
+from rich.console import Console
 from rich.progress import track
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
@@ -244,7 +245,7 @@ def relabel(
         reward_scale: learning reward = reward_scale * (reward + reward_shift).
         reward_shift: see ``reward_scale``.
         batch_size: segments encoded at once.
-        progress: show a bar.
+        progress: show a bar when standard error is a terminal.
         kept: where codes are kept on the way and where those of an earlier, stopped call are.
 
     Raises:
@@ -273,8 +274,10 @@ def relabel(
     batches = range(sum(map(len, codes)), len(starts), batch_size)
     was_training = skill.training
     skill.eval()
+    console = Console(stderr=True)
+    hidden = not (progress and console.is_terminal)
     try:
-        for first in track(batches, "relabelling", disable=not progress, transient=True):
+        for first in track(batches, "relabelling", console=console, disable=hidden, transient=True):
             codes.append(encode(slice(first, first + batch_size)))
             if kept is not None:
                 kept.write_now_and_then(codes)

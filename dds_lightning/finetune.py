@@ -149,6 +149,22 @@ class StageModule(pl.LightningModule):
         return digest.hexdigest()
 
     @classmethod
+    def starting_from(cls, path: str | Path, **settings: Any) -> Self:
+        """A new training that starts from the weights of a checkpoint, with its settings where none are given.
+
+        Args:
+            path: `.ckpt` or published directory; the same as `init_from`.
+            **settings: arguments of the constructor. `trainable`, `lr_scale` and `refit_normaliser` are never the
+                checkpoint's: they say how that one was made.
+
+        Raises:
+            UserError: as from the constructor.
+        """
+        anew = ("trainable", "lr_scale", "refit_normaliser")
+        trained = {name: value for name, value in read(cls, str(path)).hparams.items() if name not in anew}
+        return cls(**{**trained, **settings, "init_from": str(path)})
+
+    @classmethod
     def load(cls, path: str | Path) -> Self:
         """Load from a Lightning ``.ckpt`` or a published directory, in evaluation mode on the CPU."""
         from dds_lightning.checkpointing import load_module

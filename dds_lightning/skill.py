@@ -342,6 +342,13 @@ class SkillModule(StageModule):
         if isinstance(skill, Quantised):
             self.usage.update(skill.codes)
 
+    def on_validation_epoch_start(self) -> None:
+        """Forget earlier epochs here: what `Trainer.validate` left are inference tensors, which no fit may change."""
+        self.reconstruction_rmse.reset()
+        self.usage.reset()
+
+    on_test_epoch_start = on_validation_epoch_start
+
     def on_validation_epoch_end(self) -> None:
         """Log the epoch's reconstruction error and codebook health."""
         self._log_epoch("val")
@@ -352,10 +359,8 @@ class SkillModule(StageModule):
 
     def _log_epoch(self, stage: str) -> None:
         log = {"reconstruction_rmse": self.reconstruction_rmse.compute().sqrt()}
-        self.reconstruction_rmse.reset()
         if self.discrete:
             log.update(self.usage.compute())
-            self.usage.reset()
         self.log_dict({f"{stage}/{name}": value for name, value in log.items()}, prog_bar=True)
 
     def predict_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:

@@ -157,6 +157,22 @@ def test_running_averages_that_the_checkpoint_lacks_begin_at_its_vectors(starts)
     assert torch.equal(module.bottleneck.ema_count, torch.ones(4))
 
 
+@pytest.mark.parametrize("name", ["skill.ckpt", "agent"])
+def test_a_start_in_one_line_takes_the_checkpoints_settings_but_not_how_it_was_made_itself(starts, tmp_path, name):
+    module = SkillModule.starting_from(starts / name, trainable="decoder", lr=2e-3, lr_scale={"decoder": 0.5})
+    assert changed(state(SkillModule.load(starts / name)), state(module)) == set()
+    assert {key: module.hparams[key] for key in SMALL} == SMALL | {"lr": 2e-3}
+    assert module.trained_parts == ("decoder",)
+    fit(module, Segments(), 1).save_checkpoint(tmp_path / "tuned.ckpt")
+    again = SkillModule.starting_from(tmp_path / "tuned.ckpt")
+    assert again.trained_parts == ("encoder", "codebook", "decoder")
+    assert again.hparams["lr_scale"] is None
+    with pytest.warns(UserWarning, match="start anew"):
+        assert SkillModule.starting_from(starts / name, observation_dim=6).hparams["observation_dim"] == 6
+    with pytest.raises(UserError, match=r"hidden_dim is 32.*was trained with 16"):
+        SkillModule.starting_from(starts / name, hidden_dim=32)
+
+
 # -------------------------------------------------------------------- what is frozen
 
 

@@ -1,5 +1,6 @@
 """The skill model: every combination learns, the loss is the paper's, the codebook stays alive."""
 
+import copy
 import itertools
 
 import lightning.pytorch as pl
@@ -55,14 +56,19 @@ class Segments(pl.LightningDataModule):
         return DataLoader([segments()] * 2, batch_size=None)
 
 
+QUIET = {
+    "logger": False,
+    "enable_checkpointing": False,
+    "enable_progress_bar": False,
+    "enable_model_summary": False,
+}
+
+
 def fit(module: SkillModule, steps: int, **settings) -> pl.Trainer:
     trainer = pl.Trainer(
+        **QUIET,
         max_steps=steps,
-        logger=False,
         accelerator="cpu",
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
         log_every_n_steps=10,
         num_sanity_val_steps=0,
         val_check_interval=steps,
@@ -146,6 +152,17 @@ def test_validation_logs_reconstruction_and_codebook_health(trained):
     assert metrics["val/dead_codes"] == 0
     assert 3.5 < metrics["val/perplexity"] <= 4.0 + 1e-5
     assert 0 < metrics["val/reconstruction_rmse"] < 0.4
+
+
+def test_a_model_can_be_validated_before_and_after_a_fit_and_every_validation_counts_anew(trained):
+    module, trainer = copy.deepcopy(trained[0]), pl.Trainer(**QUIET, accelerator="cpu")
+    data = Segments()
+    data.val_dataloader = lambda: DataLoader([{**segments(), "actions": torch.zeros(64, 5, 2)}], batch_size=None)
+    before, before_again = (trainer.validate(module, Segments(), verbose=False)[0] for _ in range(2))
+    assert before["val/codes_used"] == before_again["val/codes_used"] == 4
+    assert trainer.validate(module, data, verbose=False)[0]["val/codes_used"] < 4
+    fit(module, 2)
+    assert trainer.validate(module, Segments(), verbose=False)[0]["val/codes_used"] == 4
 
 
 def test_a_restarted_code_forgets_its_moments():

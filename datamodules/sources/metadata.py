@@ -142,7 +142,10 @@ def _foreign(name: str, key: str, found: Any, expected: str) -> DataError:
 def _registered(name: str, env_id: Any) -> Any:
     """Gymnasium's own specification of an environment of the task table."""
     if not isinstance(env_id, str) or env_id not in known_env_ids():
-        raise DataError(f"data set '{name}': it was recorded in {_short(env_id)}, which no task uses; see `dds tasks`")
+        raise DataError(
+            f"data set '{name}': it was recorded in {_short(env_id)}, which no task uses; see `dds tasks`, or, for a "
+            "robot of your own, write the data without an environment (no env_spec in metadata.json) or give arrays:DIR"
+        )
     import gymnasium as gym  # slow, and not needed where a data set is no good anyway
 
     from dds_lightning.envs.build import register_environments

@@ -1,6 +1,7 @@
 """Relabelling: rewards and ends worked out by hand, the cache refused when it does not match."""
 
 import json
+import warnings
 
 import numpy as np
 import pandas as pd
@@ -66,6 +67,14 @@ def test_discount_per_step_counts_the_steps_really_taken(trajectories, skill):
 def test_the_learning_reward_is_shifted_then_scaled(trajectories, skill):
     made = relabel(trajectories, skill, gamma=1.0, reward_scale=0.1, reward_shift=-1.0)
     assert made.rewards[:2].tolist() == pytest.approx([0.1 * (0 + 1 + 2), 0.1 * (1 + 2 + 3)])
+
+
+def test_a_bar_is_for_terminals_and_no_notebook_is_told_to_install_one(trajectories, skill, monkeypatch, capsys):
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        relabel(trajectories, skill, progress=True)
+    assert capsys.readouterr() == ("", "")
 
 
 def test_stride_divides_episodes(trajectories, skill):
