@@ -3,8 +3,8 @@
     python benchmarks/awr_solutions.py runs/antmaze-large-diverse --alphas 3 10 30 --episodes 20
 
 Takes a finished `dds run`, keeps its skills, its transitions and its critic, and learns only the actor anew: by
-regression with weights exp(alpha A), clipped at 100 and at 1000, and, once for all alphas, as the policy of the data that
-the closed form multiplies with exp(alpha A). Then all play the same episodes, greedy and sampled.
+regression with weights exp(alpha A), clipped at 100 and at 1000, and, once for all alphas, as the policy of the data
+that the closed form multiplies with exp(alpha A). Then all play the same episodes, greedy and sampled.
 """
 
 from __future__ import annotations
