@@ -190,7 +190,7 @@ def plot(table: pd.DataFrame) -> Figure:
         _band(panels[2], own[own["stage"] == "skill"], "step", "rmse", way)
     panels[0].set(xlabel="steps in Large, skills and policy", ylabel="success in Large, %")
     panels[1].set(xlabel="seconds of one core in Large")
-    panels[2].set(xlabel="steps of skill training in Large", ylabel="error of decoded actions (RMSE)", ylim=(0, None))
+    panels[2].set(xlabel="steps of skill training in Large", ylabel="error of decoded actions (RMSE)")
     for ax in panels:
         ax.spines[["top", "right"]].set_visible(False)
     handles, labels = panels[0].get_legend_handles_labels()

@@ -43,7 +43,8 @@ def checkpoint(path, skill):
 
 
 def test_a_published_agent_has_its_page_where_it_was_asked_for(dds, place):
-    status, out, err = dds("atlas", place / "agent", "--data", place / "data", "--episodes", "0", "--out", "my.html")
+    words = ("--episodes", "0", "--out", "my.html", "--figures", "pictures")
+    status, out, err = dds("atlas", place / "agent", "--data", place / "data", *words)
     assert status == 0, err
     assert "my.html" in out
     assert "found again" in out
@@ -51,7 +52,10 @@ def test_a_published_agent_has_its_page_where_it_was_asked_for(dds, place):
     text = Path("my.html").read_text(encoding="utf-8")
     assert "Skill atlas: pointmaze-umaze-diverse" in text
     assert "--episodes" not in text.split("<footer>")[0]
-    assert sorted(path.name for path in Path().iterdir()) == ["my.html"]
+    assert sorted(path.name for path in Path().iterdir()) == ["my.html", "pictures"]
+    pictures = sorted(path.name for path in Path("pictures").iterdir())
+    assert len(pictures) == text.count("<figure>")
+    assert {"my-starts-by-skill.png", "my-recovery.png", "my-values.png", "my-diversity.png"} <= set(pictures)
     assert not [entry for entry in (place / "agent").iterdir() if entry.suffix == ".html"]
 
 
@@ -92,6 +96,9 @@ def test_mistakes_are_told_in_one_sentence(dds, place, tmp_path):
     refused(dds("atlas", "nowhere"), "there is no nowhere", "a run of `dds run`")
     refused(dds("atlas", agent, "--data", data, "--out", "atlas.png"), "--out is atlas.png", ".html")
     refused(dds("atlas", agent, "--data", data, "--episodes", "-1"), "--episodes is -1")
+    refused(
+        dds("atlas", agent, "--data", data, "--figures", agent / "config.yaml"), "--figures is", "expected a folder"
+    )
     refused(dds("atlas", agent), "does not know its data: give --data")
     alone = checkpoint(tmp_path / "alone" / "skill.ckpt", tiny_skill(TASK))
     refused(dds("atlas", alone, "--data", data), "does not say which task", "--task")

@@ -149,6 +149,7 @@ def test_its_commands_parse(script):
             build_parser()[0].parse_args(prepare(words))
 
 
+@pytest.mark.slow
 @each_script
 def test_it_runs(script):
     """With quick values: the numbers mean nothing then, and the cell that checks them is left out."""

@@ -24,6 +24,7 @@ def atlas(
     episodes: int = 5,
     against: list[str] = [],  # noqa: B006 - jsonargparse shows the default and nobody changes it
     seed: int = 0,
+    figures: str | None = None,
 ) -> Report:
     """Look at the skills of a checkpoint: one HTML page with pictures, clips and numbers, which opens offline.
 
@@ -43,6 +44,7 @@ def atlas(
         episodes: of the policy and of each single skill that are played, unless a run has played already; 0 for none
         against: other skill checkpoints, for example of other seeds or with continuous skills, to compare with
         seed: of everything random
+        figures: a folder in which each picture is also written as a small PNG file, named after the page
     """
     from dds_lightning.hub import is_hub, pull
 
@@ -51,6 +53,8 @@ def atlas(
         raise UserError(f"--out is {out}, expected the name of a file that ends in .html")
     if episodes < 0:
         raise UserError(f"--episodes is {episodes}, expected a number of episodes, or 0 for none")
+    if figures is not None and Path(figures).is_file():
+        raise UserError(f"--figures is {figures}, a file, expected a folder")
     root = pull(place) if is_hub(place) else Path(place)
     if not root.exists():
         raise UserError(f"there is no {place}: give a run of `dds run`, a published directory or a skill checkpoint")
@@ -59,7 +63,8 @@ def atlas(
     from dds_lightning.study.atlas import atlas as make
 
     with _progress(STAGES + len(against)) as tell:
-        made, path = make(root, spec, task, page, episodes, [Path(one) for one in against], seed, tell)
+        others, folder = [Path(one) for one in against], Path(figures) if figures else None
+        made, path = make(root, spec, task, page, episodes, others, seed, folder, tell)
     found, trip, shown = made.recovery, made.trip, made.table[[name for name in SHOWN if name in made.table]]
     lines = [
         ("codes in use", f"{len(found.codes)} of {len(made.table)}"),
@@ -81,7 +86,7 @@ def _progress(total: int) -> Iterator[Callable[[str], None]]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-    console = Console(stderr=True)
+    console = Console(stderr=True, force_jupyter=False)  # lines there too, not a display for each
     columns = (SpinnerColumn(), BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         line = bar.add_task("atlas", total=total)

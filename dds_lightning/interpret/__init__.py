@@ -7,16 +7,18 @@ import importlib
 from typing import Any
 
 _ROOMS = {
-    "atlas": ("Atlas", "make_atlas", "write_atlas"),
+    "atlas": ("Atlas", "make_atlas", "write_atlas", "write_pictures"),
+    "atlas_pictures": ("most_different",),
     "body": ("body_frames", "root_path"),
     "charts": (
-        *("plot_comparison", "plot_distances", "plot_matrix", "plot_recovery", "plot_round_trip"),
-        *("plot_transitions", "plot_where"),
+        *("plot_comparison", "plot_distances", "plot_diversity", "plot_effects", "plot_matrix"),
+        *("plot_recovery", "plot_round_trip", "plot_transitions", "plot_where"),
     ),
     "clip": ("replay_clip", "write_clip"),
-    "comparison": ("cluster_skills", "compare_recovery"),
+    "comparison": ("cluster_skills", "compare_recovery", "decoding_error"),
     "information": ("mutual_information",),
     "maze": ("plot_skills_by_start", "plot_starts_by_skill", "plot_trajectories"),
+    "png": ("png_bytes", "small_png"),
     "recovery": ("code_recovery", "encode_replays", "round_trip"),
     "rendering": ("plot_rendered", "render_frames"),
     "replay": ("body_states", "draw_states", "junctions", "replay_codes", "rest_states", "simulator"),

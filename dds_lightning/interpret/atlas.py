@@ -24,6 +24,7 @@ from dds_lightning.files import written_whole
 from dds_lightning.interpret import charts, statistics
 from dds_lightning.interpret.atlas_pictures import Picture, Studio, Tell
 from dds_lightning.interpret.comparison import compare_recovery
+from dds_lightning.interpret.png import small_png
 from dds_lightning.interpret.recovery import Recovery, RoundTrip, code_recovery, round_trip
 from dds_lightning.interpret.replay import draw_states, simulator
 from dds_lightning.results import RolloutResult
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     from dds_lightning.agent import DDSAgent
     from dds_lightning.skill import SkillModule
 
-STATES, STARTS = 32, 4
+STATES, STARTS = 32, 8
 """States from which codes are recovered, and among which the start of a body's pictures is chosen."""
 DISCRETE, CONTINUOUS = "discrete skills", "continuous skills, clustered"
 """What models that are compared are called, by kind."""
@@ -154,6 +155,7 @@ def make_atlas(
         studio.values()
     tell("drawing")
     transitions = statistics.transition_matrix(coded)
+    studio.diversity(table)
     studio.matrices(trip, recovery, transitions, distances, coded)
     comparison = None
     if others:
@@ -198,6 +200,24 @@ def write_atlas(atlas: Atlas, path: str | Path, about: Sequence[tuple[str, str]]
     with written_whole(path) as part:
         part.write_text(page(atlas, about, command), encoding="utf-8")
     return path
+
+
+def write_pictures(atlas: Atlas, folder: str | Path, prefix: str) -> list[Path]:
+    """Write each picture of the page as a small PNG file, `PREFIX-PICTURE.png`, for papers, slides and READMEs.
+
+    Args:
+        atlas: what `make_atlas` made.
+        folder: where to; made if it is not there.
+        prefix: how the files' names begin.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for name, picture in atlas.pictures.items():
+        paths.append(folder / f"{prefix}-{name.replace('_', '-')}.png")
+        with written_whole(paths[-1]) as part:
+            part.write_bytes(small_png(picture.data))
+    return paths
 
 
 def _alone(task: Task, result: RolloutResult, singles: str) -> pd.DataFrame:

@@ -57,6 +57,8 @@ def measures(task: Task) -> list[Measure]:
         Measure("dx", "along x", "m", "+.2f", 1, "Mean displacement along x."),
         Measure("dy", "along y", "m", "+.2f", 1, "Mean displacement along y."),
         Measure("dz", "along z", "m", "+.2f", 1, "Mean displacement along z."),
+        Measure("ahead", "ahead", "m", "+.2f", 1, "Mean displacement along the way it faces when a segment begins."),
+        Measure("left", "to its left", "m", "+.2f", 1, "Mean displacement across that way."),
         Measure("speed", "speed", fast, ".2f", 1, "Mean speed along the way."),
         Measure("turn", "pitch change" if runner else "turn", "°", "+.1f", 1, f"How far {turn}, on average."),
         Measure("turning", "turning", "°", ".1f", 1, "The size of it, left or right.", False),
@@ -110,17 +112,16 @@ def _sections(atlas: Atlas) -> Iterable[tuple[str, str, str] | None]:
 
     def pictures(name: str, words: str, wanted: Sequence[str], before: str = "", after: str = "") -> Any:
         shown = "".join(_figure(atlas.pictures[one]) for one in wanted if one in atlas.pictures)
-        return (name, words, before + shown + after) if shown or after else None
+        return (name, words, f'{before}<div class="figures">{shown}</div>{after}') if shown or after else None
 
     yield pictures("replays", "What each skill does", ("strobe", "rendered", "starts_by_skill", "skills_by_start"))
     yield pictures("episodes", "How the policy strings them together", ("stitching", "trajectories"))
     yield pictures("values", "What the critic believes", ("values",))
     yield "skills", "The skills one by one", _cards(atlas)
-    yield pictures(
-        "recovery", "Is a skill told by what it does?", ("trip", "recovery", "comparison"), _recovery_words(atlas)
-    )
+    told = ("trip", "recovery", "effects", "comparison")
+    yield pictures("recovery", "Is a skill told by what it does?", told, _recovery_words(atlas))
     yield pictures("places", "Where they are used", ("where",))
-    yield pictures("relations", "What lies between them", ("transitions", "distances"))
+    yield pictures("relations", "What lies between them", ("transitions", "distances", "diversity"))
     yield "numbers", "All numbers", _table(atlas)
 
 
@@ -251,7 +252,8 @@ def _compared(comparison: pd.DataFrame | None) -> str:
         f"<tr><th scope='row'>{escape(str(row.model))}</th><td>{row.seed}</td><td>{escape(str(row.kind))}</td>"
         f"<td>{row.codes}</td><td>{100 * row.own_accuracy:.1f}</td><td>{100 * row.own_control:.1f}</td>"
         f"<td>{100 * row.accuracy:.1f}</td><td>{100 * row.chance:.1f}</td>"
-        f"<td>{row.information_in_state:.2f}</td><td>{row.information:.2f}</td><td>{row.most:.2f}</td></tr>"
+        f"<td>{row.information_in_state:.2f}</td><td>{row.information:.2f}</td><td>{row.most:.2f}</td>"
+        f"<td>{row.decoded:.3g}</td><td>{'–' if _missing(row.decoded_own) else f'{row.decoded_own:.3g}'}</td></tr>"
         for row in comparison.itertuples()
     )
     names = (
@@ -259,11 +261,15 @@ def _compared(comparison: pd.DataFrame | None) -> str:
         "seed",
         "skills",
         "codes",
+        "found again %",
+        "another held %",
         "recovered %",
         "chance %",
         "bits in a state",
         "bits over all",
         "at most",
+        "decoding error",
+        "with own vectors",
     )
     heads = "".join(f'<th scope="col">{name}</th>' for name in names)
     return (

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from dds_lightning.interpret import charts, clip, maze, stitching, strobe, values
 from dds_lightning.interpret.body import body_frames, has_limbs
+from dds_lightning.interpret.png import png_bytes
 from dds_lightning.interpret.rendering import plot_rendered, render_frames
 from dds_lightning.interpret.replay import BodyStates, Replays, junctions, replay_codes, rest_states
 from dds_lightning.results import RolloutResult
@@ -30,7 +31,7 @@ HELD = {"pointmaze": 1.0, "antmaze": 6.0, "locomotion": 1.0, "kitchen": 2.4}
 BODIES = {"antmaze": 4, "locomotion": 8, "kitchen": 6}
 """Bodies between the first and the last of a stroboscopic picture."""
 STROBES = 4
-"""Skills in a stroboscopic picture: the commonest, and those that move most differently from it and each other."""
+"""Skills in a stroboscopic picture."""
 
 Tell = Callable[[str], None]
 """Told in words what is being done."""
@@ -57,24 +58,36 @@ class Picture:
     mime: str = "image/png"
 
 
-def different_codes(table: pd.DataFrame, used: NDArray[Any], count: int = STROBES) -> list[int]:
-    """The commonest code, then those that move most differently from all chosen so far.
+def most_different(paths: NDArray[Any], share: NDArray[Any], count: int = STROBES) -> tuple[int, NDArray[np.int64]]:
+    """The state from which some codes move most differently, and these codes.
+
+    Two codes are as far apart as the body's positions are, each in units of its spread over all replays, root mean
+    square over time; after the end of either they count as equal. From each state the commonest code is taken, then
+    the one that is farthest from all before; the state is that in which the nearest two of them are farthest apart.
 
     Args:
-        table: of `statistics.skill_table`.
-        used: codes to choose among.
-        count: how many.
+        paths: (C, S, T + 1, P) positions under C codes from S states; NaN after a replay's end.
+        share: (C,) of the data.
+        count: how many codes; C at most.
+
+    Returns:
+        The state's number, and the codes' rows, in their order.
     """
-    names = [n for n in ("dx", "dy", "dz", "distance", "speed", "turn", "action", "change") if n in table]
-    features = table.set_index("code").loc[used, names].fillna(0.0).to_numpy()
-    features = (features - features.mean(axis=0)) / np.maximum(features.std(axis=0), 1e-9)
-    share = table.set_index("code").loc[used, "share"].to_numpy()
-    chosen = [int(share.argmax())]
-    while len(chosen) < min(count, len(used)):
-        away = np.linalg.norm(features[:, None] - features[chosen][None], axis=-1).min(axis=1)
-        away[chosen] = -1.0
-        chosen.append(int(away.argmax()))
-    return [int(used[i]) for i in sorted(chosen)]
+    moved = paths - paths[:, :, :1]
+    scale = np.nanstd(moved, axis=(0, 1, 2))
+    moved = moved / np.where(scale > 0, scale, 1.0)
+    best: tuple[float, int, list[int]] = (-1.0, 0, [])
+    for state in range(paths.shape[1]):
+        own = moved[:, state]  # (C, T + 1, P)
+        away = np.sqrt(np.square(np.nan_to_num(own[:, None] - own[None])).mean(axis=(2, 3)))  # (C, C)
+        chosen, least = [int(np.argmax(share))], np.inf
+        while len(chosen) < min(count, len(own)):
+            nearest = away[:, chosen].min(axis=1)
+            nearest[chosen] = -1.0
+            chosen.append(int(nearest.argmax()))
+            least = min(least, float(nearest.max()))
+        best = max(best, (least, state, chosen), key=lambda found: found[0])
+    return best[1], np.sort(best[2])
 
 
 class Studio:
@@ -89,10 +102,8 @@ class Studio:
 
     def keep(self, name: str, figure: Figure, caption: str, alt: str) -> None:
         """Keep a figure as a picture of the page."""
-        file = io.BytesIO()
-        figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None})
-        size = tuple(int(side * DPI) for side in figure.get_size_inches())
-        self.pictures[name] = Picture(name, caption, alt, file.getvalue(), size)  # type: ignore[arg-type]
+        width, height = (int(side * DPI) for side in figure.get_size_inches())
+        self.pictures[name] = Picture(name, caption, alt, png_bytes(figure, DPI), (width, height))
 
     def _clip(self, code: int, data: bytes, alt: str) -> None:
         from PIL import Image
@@ -127,30 +138,30 @@ class Studio:
             self.keep(
                 "skills_by_start",
                 maze.plot_skills_by_start(task, *shown, reach=_reach(task, positions)),
-                "One panel a start, seen from near: every skill from the same place. A number is where it ended.",
+                "One panel a start, seen from near: every skill from the same place. A number is where it ended, or "
+                "left the panel.",
                 f"{len(states)} close-ups of the maze, each with the paths of {len(used)} skills from one start.",
             )
         if has_limbs(task):
             self._movement(table, used, made, clips=not maze_like)
 
     def _movement(self, table: pd.DataFrame, used: NDArray[Any], made: Replays, clips: bool) -> None:
-        """Bodies under several skills from the same state: that in which they last longest and come furthest."""
+        """Bodies under several skills from the same state: that in which they differ most."""
         model = self.env.unwrapped.model
-        rows = len(made.codes) // len(used)
-        ends = made.qpos[np.arange(len(made.codes)), made.lengths]
-        far = np.linalg.norm(ends[:, :2] - made.qpos[:, 0, :2], axis=1).reshape(-1, rows).mean(axis=0)
-        state = int(np.lexsort((far, made.lengths.reshape(-1, rows).sum(axis=0)))[-1])
+        share = table.set_index("code").loc[used, "share"].to_numpy()
+        paths = made.qpos.reshape(len(used), -1, *made.qpos.shape[1:])  # (C, S, T + 1, nq)
+        state, rows = most_different(paths, share)
+        chosen = [int(code) for code in used[rows]]
         own = made.take(made.states == state)
         bodies = {int(code): body_frames(model, qpos) for code, qpos in zip(own.codes, own.qpos, strict=True)}
         every = max(self.steps // BODIES.get(self.task.family, 6), 1)
-        chosen = different_codes(table, used)
         moments = (
             f"a body every {every * self.task.step_seconds:.2g} s, the last one solid, lines are the ways of joints"
         )
         self.keep(
             "strobe",
             strobe.plot_strobes(self.task, {code: bodies[code] for code in chosen}, every),
-            f"The same state, {len(chosen)} skills: {moments}. Drawn from the positions of the model's own bodies.",
+            f"{len(chosen)} skills from the same state, that of {paths.shape[1]} in which they differ most: {moments}.",
             f"Stick figures of the body at several moments under skills {', '.join(map(str, chosen))}.",
         )
         if clips:
@@ -203,6 +214,16 @@ class Studio:
             "Heat map of the critic's value over the maze, in each cell the number and direction of the chosen skill.",
         )
 
+    def diversity(self, table: pd.DataFrame) -> None:
+        """How much noise changes an action, and how much a code does."""
+        self.keep(
+            "diversity",
+            charts.plot_diversity(table),
+            "The decoder's actions in the same states, 16 draws of noise each. Where the mark stands above the bar, "
+            "the code says more about the action than chance does.",
+            f"Bars of the spread over noise of {len(table)} codes, with marks for how far their actions lie apart.",
+        )
+
     def matrices(
         self,
         trip: RoundTrip,
@@ -226,6 +247,14 @@ class Studio:
             f"Recovery: {count} codes, each held for {recovery.steps} steps from the same {recovery.states} states, "
             "wherever the data have been. Equal rows: there the state decides, not the code.",
             f"Confusion matrix of {count} codes: {recovery.accuracy:.0%} recovered, chance {recovery.chance:.0%}.",
+        )
+        self.keep(
+            "effects",
+            charts.plot_effects(self.task, recovery),
+            f"The same replays: where each leads in {recovery.steps} steps, less the mean of all skills from that "
+            "state, because a body that moves goes on moving whatever it is told. A dot is a replay, a number the mean "
+            "of its skill.",
+            f"Displacements under {count} codes as clouds of dots with the code's number in the middle of each.",
         )
         self.keep(
             "transitions",

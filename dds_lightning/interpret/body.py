@@ -176,10 +176,31 @@ def root_path(task: Task, model: Any, qpos: NDArray[Any]) -> Floats:
     return places.reshape(*qpos.shape[:-1], 3)
 
 
-PATH_NAMES = {"locomotion": ("x", "z"), "kitchen": ("x", "y", "z")}
-"""Names of the D coordinates of `root_path`; in a maze x and y."""
+def to_body(task: Task, away: NDArray[Any], quaternions: NDArray[Any]) -> Floats:
+    """Displacements as the body itself sees them: an ant's ahead and to its left, any other body's as they are.
+
+    Args:
+        task: whose body.
+        away: (..., 2) along x and y; of bodies that do not turn any width.
+        quaternions: (..., 4) an ant's attitude, w first; anything of other bodies.
+    """
+    away = np.asarray(away, dtype=np.float64)
+    if task.family != "antmaze":
+        return away
+    w, x, y, z = np.moveaxis(np.asarray(quaternions, dtype=np.float64), -1, 0)
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+    ahead = np.cos(yaw) * away[..., 0] + np.sin(yaw) * away[..., 1]
+    return np.stack([ahead, np.cos(yaw) * away[..., 1] - np.sin(yaw) * away[..., 0]], axis=-1)
+
+
+PATH_NAMES = {
+    "locomotion": ("along x", "along z"),
+    "kitchen": ("along x", "along y", "along z"),
+    "antmaze": ("ahead of the ant", "to its left"),
+}
+"""Names of the D coordinates of `root_path` after `to_body`; of a point along x and y."""
 
 
 def path_names(task: Task) -> tuple[str, ...]:
-    """Names of the coordinates of `root_path`."""
-    return PATH_NAMES.get(task.family, ("x", "y"))
+    """Names of the coordinates of `root_path` after `to_body`."""
+    return PATH_NAMES.get(task.family, ("along x", "along y"))

@@ -8,11 +8,15 @@ import numpy as np
 import pandas as pd
 from matplotlib.colors import LinearSegmentedColormap, to_hex
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from dds_lightning.interpret.body import path_names
 from dds_lightning.interpret.drawing import (
     LABEL,
     TICKS,
+    draw_number,
     draw_walls,
     frame,
     grid,
@@ -34,6 +38,8 @@ NUMBERED = 24
 """Codes up to which a matrix has its numbers written in."""
 SQUARES = 3
 """Squares a maze's cell on each axis, for where a code is used."""
+BAR = 0.45
+"""Inches of a colour bar below some panels, with its label."""
 SEEN = 5
 """Segments that a square needs to be told."""
 DOTS = 400
@@ -95,29 +101,87 @@ def plot_matrix(
 
 def plot_recovery(found: Recovery) -> Figure:
     """The confusion matrix of `recovery.code_recovery`, accuracy and chance in its title."""
-    title = f"from any state: recovered in {found.accuracy:.0%} (chance {found.chance:.0%})"
+    title = f"From any state: recovered in {found.accuracy:.0%} (chance {found.chance:.0%})"
     return plot_matrix(found.confusion, found.codes, "code that the encoder finds", "code that was held", title)
 
 
 def plot_round_trip(found: RoundTrip) -> Figure:
     """The confusion matrix of `recovery.round_trip`, accuracy, control and chance in its title."""
     control = "" if np.isnan(found.control) else f", another code held {found.control:.0%}"
-    title = f"in its own states: found again in {found.accuracy:.0%}\n(chance {found.chance:.0%}{control})"
+    title = f"In its own states: found again in {found.accuracy:.0%}\n(chance {found.chance:.0%}{control})"
     return plot_matrix(found.confusion, found.codes, "code that the encoder finds", "code that was held", title)
 
 
 def plot_transitions(matrix: NDArray[Any]) -> Figure:
     """The matrix of `statistics.transition_matrix`."""
     codes = np.arange(len(matrix))
-    return plot_matrix(matrix, codes, "code of the next segment", "code of a segment", "what follows what in the data")
+    return plot_matrix(matrix, codes, "code of the next segment", "code of a segment", "What follows what in the data")
 
 
 def plot_distances(distances: NDArray[Any]) -> Figure:
     """The matrix of `statistics.code_distances`."""
     shown = np.asarray(distances, dtype=float).copy()
     np.fill_diagonal(shown, np.nan)
-    title = "distance between the codebook's vectors"
+    title = "Distance between the codebook's vectors"
     return plot_matrix(shown, np.arange(len(shown)), "code", "code", title, ".2g", 1.0, 0.0, "distance")
+
+
+def plot_effects(task: Task, found: Recovery) -> Figure:
+    """What each code does to the displacement, a dot a state and the code's number at its mean.
+
+    Args:
+        task: where it was measured.
+        found: of `recovery.code_recovery`.
+    """
+    names = path_names(task)
+    across, up = 0, len(names) - 1
+    figure = Figure(figsize=(6.0, 5.4), layout="constrained")
+    ax = figure.add_subplot()
+    effects = 100 * found.effects[..., [across, up]]
+    for code, dots in zip(found.codes, effects, strict=True):
+        ax.plot(*dots.T, ".", color=skill_colour(int(code)), markersize=4, alpha=0.5)
+    for code, dots in zip(found.codes, effects, strict=True):
+        draw_number(ax, np.nanmean(dots, axis=0), int(code))
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.set_xlabel(f"{names[across]}, less the mean of all skills (cm)", fontsize=LABEL - 1)
+    ax.set_ylabel(f"{names[up]} (cm)", fontsize=LABEL - 1)
+    ax.tick_params(labelsize=TICKS - 1.5)
+    ax.set_title(
+        f"Where each skill leads in {found.steps} steps: {found.information_in_state:.1f} bits of {found.most:.2g}",
+        fontsize=LABEL - 1,
+    )
+    ax.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def plot_diversity(table: pd.DataFrame) -> Figure:
+    """How much noise alone changes an action, and how much the code does, one bar and one mark a code.
+
+    Args:
+        table: of `statistics.decoder_diversity`, or any with its columns.
+    """
+    figure = Figure(figsize=(7.0, 2.6), layout="constrained")
+    ax = figure.add_subplot()
+    codes = table["code"].to_numpy()
+    colours = [skill_colour(int(code)) for code in codes]
+    places = np.arange(len(codes))
+    ax.bar(places, 100 * table["spread"], color=colours, width=0.7)
+    mark: dict[str, Any] = {"marker": "D", "markersize": 5.5, "linestyle": "", "color": "white"}
+    mark["markeredgecolor"] = "black"
+    ax.plot(places, 100 * table["apart"], **mark)
+    ax.set_xticks(places, [str(code) for code in codes])
+    ax.set(xlim=(-0.6, len(codes) - 0.4), ylim=(0.0, None))
+    ax.set_xlabel("skill", fontsize=LABEL - 1)
+    ax.set_ylabel("% of half the\naction box", fontsize=LABEL - 1)
+    ax.tick_params(labelsize=TICKS - 1.5)
+    ax.spines[["top", "right"]].set_visible(False)
+    handles = [
+        Patch(facecolor=NO_SKILL, label="spread of its actions over noise"),
+        Line2D([], [], **mark, label="its mean action from that of all skills"),
+    ]
+    place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.0}
+    ax.legend(handles=handles, fontsize=9, frameon=False, ncols=2, **place)
+    return figure
 
 
 def plot_where(task: Task | None, segments: CodedSegments) -> Figure:
@@ -167,6 +231,7 @@ def _where_in_maze(task: Task, segments: CodedSegments) -> Figure:
     shares = 100 * np.divide(counts, total, out=np.full_like(counts, np.nan), where=total >= SEEN)
     shown = np.flatnonzero(segments.share > 0)
     figure, axes = grid(len(shown), 1.75, panel_height(task, 1.75))
+    figure.set_figheight(figure.get_figheight() + BAR)
     x = first[0] + step[0] * np.arange(wide + 1) / SQUARES
     y = first[1] + step[1] * np.arange(tall + 1) / SQUARES
     top = float(np.nanquantile(shares[shares > 0], 0.98)) if (shares > 0).any() else 1.0
@@ -183,19 +248,20 @@ def _where_in_maze(task: Task, segments: CodedSegments) -> Figure:
 
 
 def plot_comparison(table: pd.DataFrame) -> Figure:
-    """Recovery and information of several models, a dot a seed, the mean as a bar.
+    """Recovery, information and decoding error of several models, a dot a seed, the mean as a bar.
 
     Args:
         table: of `recovery.compare_recovery`.
     """
     names = list(dict.fromkeys(table["model"]))
-    figure = Figure(figsize=(7.0, 0.55 * len(names) + 1.4), layout="constrained")
+    figure = Figure(figsize=(7.0, 2 * (0.5 * len(names) + 1.25)), layout="constrained")
     columns = (
         ("own_accuracy", 100.0, "found again in\nits own states (%)", "own_control", "another code held"),
         ("accuracy", 100.0, "recovered from\nany state (%)", "chance", "chance"),
         ("information_in_state", 1.0, "information about\nwhere it leads (bits)", "most", "most possible"),
+        ("decoded", 1.0, "error of decoded actions\n(root mean square)", "decoded_own", "each segment's own vector"),
     )
-    axes = figure.subplots(1, len(columns), sharey=True)
+    axes = figure.subplots(2, 2, sharey=True).ravel()
     for ax, (column, factor, label, line, words) in zip(axes, columns, strict=True):
         for place, name in enumerate(names):
             rows = table[table["model"] == name]
@@ -212,6 +278,8 @@ def plot_comparison(table: pd.DataFrame) -> Figure:
         ax.set_xlim(left=0.0)
         ax.legend(fontsize=8.5, frameon=False, loc="lower left", bbox_to_anchor=(-0.05, 0.99), borderaxespad=0.0)
     names = [name.replace(", ", ",\n") for name in names]
-    axes[0].set_yticks(range(len(names)), names, fontsize=TICKS - 1)
+    axes[0].set_yticks(range(len(names)), names)
     axes[0].invert_yaxis()
+    for ax in axes[::2]:
+        ax.tick_params(axis="y", labelsize=TICKS - 1)
     return figure

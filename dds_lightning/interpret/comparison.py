@@ -6,7 +6,8 @@ centre is what is replayed. From there on both kinds are measured by the same fu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import math
+from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from datamodules.relabel import check_widths
 from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError
 from dds_lightning.interpret.recovery import code_recovery, round_trip
-from dds_lightning.interpret.replay import Skills, draw_states, simulator
+from dds_lightning.interpret.replay import draw_states, simulator
 from dds_lightning.tasks import Task
 
 if TYPE_CHECKING:
@@ -74,21 +75,65 @@ def cluster_skills(
     if skill.discrete:
         raise UserError("bottleneck is vq: its skills are discrete already, only gaussian ones are put into clusters")
     check_widths(trajectories, skill)
-    windows = trajectories.windows(skill.horizon)
-    chosen = np.sort(np.random.default_rng(seed).permutation(len(windows))[:segments])
-    if len(chosen) < clusters:
-        raise UserError(f"clusters is {clusters}, but the data have only {len(chosen)} segments: ask for fewer")
-    span = np.arange(skill.horizon)
-    observations = trajectories.observations[windows.observation_starts[chosen, None] + span]  # (M, H, O)
-    actions = trajectories.actions[windows.starts[chosen, None] + span]  # (M, H, A)
     skill.eval()
     means = []
-    for part in np.array_split(np.arange(len(chosen)), max(len(chosen) // 2048, 1)):
-        pair = (torch.from_numpy(values[part]).to(skill.device) for values in (observations, actions))
-        found: Any = skill.encode_segments(*pair)
+    for observations, actions in _segments(trajectories, skill.horizon, segments, seed, skill.device):
+        found: Any = skill.encode_segments(observations, actions)
         means.append(found.mean.float().cpu().numpy())
-    centres, _ = kmeans2(np.concatenate(means), clusters, iter=30, minit="++", rng=seed)
+    encodings = np.concatenate(means)
+    if len(encodings) < clusters:
+        raise UserError(f"clusters is {clusters}, but the data have only {len(encodings)} segments: ask for fewer")
+    centres, _ = kmeans2(encodings, clusters, iter=30, minit="++", rng=seed)
     return ClusteredSkills(skill, torch.as_tensor(centres, dtype=torch.float32, device=skill.device))
+
+
+def _segments(
+    trajectories: Trajectories, horizon: int, count: int, seed: int, device: torch.device
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Drawn segments of the data in batches: observations (B, H, O) and actions (B, H, A)."""
+    windows = trajectories.windows(horizon)
+    chosen = np.sort(np.random.default_rng(seed).permutation(len(windows))[:count])
+    span = np.arange(horizon)
+    for part in np.array_split(chosen, max(len(chosen) // 2048, 1)):
+        observations = trajectories.observations[windows.observation_starts[part, None] + span]
+        actions = trajectories.actions[windows.starts[part, None] + span]
+        yield torch.from_numpy(observations).to(device), torch.from_numpy(actions).to(device)
+
+
+@torch.no_grad()
+def decoding_error(
+    skill: SkillModule | ClusteredSkills, trajectories: Trajectories, segments: int = 1000, seed: int = 0
+) -> float:
+    """How far decoded actions are from those of the data, in the environment's units.
+
+    Each segment is encoded, and an action drawn in each of its states, with the model's full noise, under what was
+    found: the code of discrete skills, the centre of a continuous one's cluster, or, for a continuous model itself, the
+    segment's own vector.
+
+    Args:
+        skill: any of the three.
+        trajectories: the data; best such that the model was not trained on.
+        segments: that are decoded, drawn from all.
+        seed: of the draw and of the noise.
+
+    Returns:
+        The root mean square error of one entry of an action.
+    """
+    model = skill.skill if isinstance(skill, ClusteredSkills) else skill
+    check_widths(trajectories, model)
+    model.eval()
+    stream = torch.Generator(model.device).manual_seed(seed)
+    squares = []
+    for observations, actions in _segments(trajectories, model.horizon, segments, seed, model.device):
+        seen, horizon = observations.flatten(0, 1), model.horizon
+        if isinstance(skill, ClusteredSkills) or model.discrete:
+            held = skill.encode(observations, actions).repeat_interleave(horizon)
+            decoded = skill.decode(seen, held, 1.0, stream)
+        else:
+            found: Any = model.encode_segments(observations, actions)
+            decoded = model.decode_vectors(seen, found.mean.repeat_interleave(horizon, dim=0), 1.0, stream)
+        squares.append((decoded - actions.flatten(0, 1)).square().mean(dim=-1))
+    return float(torch.cat(squares).mean().sqrt())
 
 
 def compare_recovery(
@@ -113,7 +158,9 @@ def compare_recovery(
 
     Returns:
         A row a model: `model`, `seed` (counted within its name), `kind` ("discrete" or "continuous"), the facts of
-        `recovery.Recovery`, and `own_accuracy` and `own_control`, those of `recovery.round_trip`.
+        `recovery.Recovery`, `own_accuracy` and `own_control`, those of `recovery.round_trip`, and `decoded`, the
+        `decoding_error` under codes, with `decoded_own`, that under each segment's own vector (NaN for discrete skills,
+        which have none).
 
     Raises:
         UserError: continuous models alone, and no `clusters`.
@@ -130,10 +177,14 @@ def compare_recovery(
                 report(name)
             check_widths(trajectories, model)
             kind = "discrete" if model.discrete else "continuous"
-            skills: Skills = model if model.discrete else cluster_skills(model, trajectories, known, seed=seed)
+            skills = model if model.discrete else cluster_skills(model, trajectories, known, seed=seed)
             found, _ = code_recovery(task, skills, drawn, seed=seed, env=env)
             own = round_trip(task, skills, trajectories, states, seed=seed, env=env)
             number = sum(row["model"] == name for row in rows)
             trip = {"own_accuracy": own.accuracy, "own_control": own.control}
-            rows.append({"model": name, "seed": number, "kind": kind, **found.facts(), **trip})
+            errors = {
+                "decoded": decoding_error(skills, trajectories, seed=seed),
+                "decoded_own": math.nan if model.discrete else decoding_error(model, trajectories, seed=seed),
+            }
+            rows.append({"model": name, "seed": number, "kind": kind, **found.facts(), **trip, **errors})
     return pd.DataFrame(rows)

@@ -23,6 +23,9 @@ from dds_lightning.tasks import Task
 LABEL, TICKS, NUMBER = 12.0, 11.0, 9.0
 """Font sizes of a figure 7 inches wide: printed over one column of 3.5 inches they are half of this."""
 
+CROPPED = 0.6
+"""Cells of the outer wall that small panels leave out on each side."""
+
 
 def draw_walls(ax: Axes, task: Task, goal: bool = True) -> None:
     """Draw the maze, one square a wall cell, with axes in metres and where the goal counts as reached.
@@ -142,9 +145,28 @@ def grid(count: int, width: float, height: float, columns: int = 4) -> tuple[Fig
 
 
 def panel_height(task: Task, width: float) -> float:
-    """Height in inches of a panel that shows the whole maze under a heading."""
-    assert task.maze_map is not None
-    return width * len(task.maze_map) / len(task.maze_map[0]) + 0.25
+    """Height in inches of a panel that shows a cropped maze under a heading."""
+    return width * _proportion(task, CROPPED) + 0.25
+
+
+def crop(ax: Axes, task: Task) -> None:
+    """Leave out most of the outer wall: a small panel needs the room."""
+    (left, right), (bottom, top) = extent(task)
+    less = CROPPED * task.cell_size
+    ax.set(xlim=(left + less, right - less), ylim=(bottom + less, top - less))
+
+
+def maze_figure(task: Task) -> tuple[Figure, Axes]:
+    """A figure 7 inches wide with one maze and room for a legend or a colour bar beside it."""
+    figure = Figure(figsize=(7.0, 5.1 * _proportion(task) + 0.9), layout="constrained")
+    return figure, figure.add_subplot()
+
+
+def _proportion(task: Task, cropped: float = 0.0) -> float:
+    """Height of a maze over its width, without so many cells on each side."""
+    (left, right), (bottom, top) = extent(task)
+    less = 2 * cropped * task.cell_size
+    return (top - bottom - less) / (right - left - less)
 
 
 def heading(ax: Axes, code: int, text: str = "") -> None:
@@ -162,5 +184,6 @@ def heading(ax: Axes, code: int, text: str = "") -> None:
 def frame(figure: Figure, axes: Iterable[Axes], task: Task, title: str) -> None:
     """For panels too small for axes: no ticks, the scale in the title."""
     for ax in axes:
+        crop(ax, task)
         ax.set(xlabel="", ylabel="", xticks=[], yticks=[])
     figure.suptitle(f"{title} (a wall square: {task.cell_size:g} m)", fontsize=TICKS)

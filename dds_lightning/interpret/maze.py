@@ -27,6 +27,7 @@ from dds_lightning.interpret.drawing import (
     frame,
     grid,
     heading,
+    maze_figure,
     panel_height,
     zoom,
 )
@@ -106,8 +107,7 @@ def plot_trajectories(task: Task, result: RolloutResult, actor: str, episodes: i
         UserError: no such contestant, or no recorded paths of it.
     """
     rows = sorted(_paths_of(result, actor), key=lambda row: not row[0].success)[:episodes]
-    figure = Figure(figsize=(7.0, 4.7), layout="constrained")
-    ax = figure.add_subplot()
+    figure, ax = maze_figure(task)
     draw_walls(ax, task)
     for index, (_, path) in reversed(list(enumerate(rows))):  # those with numbers come last, on top
         draw_path(ax, path, linewidth=1.6, numbers=0.5 * task.cell_size if index < numbered else 0.0)
@@ -188,6 +188,8 @@ def plot_skills_by_start(
 ) -> Figure:
     """All skills from each of several starts, one panel a start, seen from near.
 
+    A skill's number is where its replay ends, or leaves the panel.
+
     Args:
         task: the maze.
         starts: (N, 2) metres, where each replay was put; equal rows share a panel.
@@ -197,17 +199,17 @@ def plot_skills_by_start(
         reach: half a side of the window in metres; without it two cells and a half.
     """
     places, panel = np.unique(np.asarray(starts), axis=0, return_inverse=True)
-    figure, axes = grid(len(places), 2.4, 2.45)
+    figure, axes = grid(len(places), 7.0 / 3, 2.4, columns=3)
     lengths = _lengths(positions, alive)
     for index, ax in enumerate(axes):
         draw_walls(ax, task)
         members = np.flatnonzero(np.ravel(panel) == index)
         for n in members:
             draw_trail(ax, positions[n, : lengths[n] + 1], int(codes[n]), 1.6)
-        for n in members:  # above every path
-            draw_number(ax, positions[n, lengths[n]], int(codes[n]), size=6.5)
         draw_starts(ax, [positions[n, 0] for n in members], task.cell_size, size=19)
         zoom(ax, task, places[index], REACH * task.cell_size if reach is None else reach)
+        for n in members:  # above every path
+            draw_number(ax, _last_seen(ax, positions[n, : lengths[n] + 1]), int(codes[n]), size=6.5)
         ax.tick_params(labelsize=8)
         ax.xaxis.get_label().set_fontsize(9)
         ax.yaxis.get_label().set_fontsize(9)
@@ -216,6 +218,13 @@ def plot_skills_by_start(
     steps = positions.shape[1] - 1
     figure.suptitle(f"Every skill alone from the same start, {steps} steps; one panel a start", fontsize=LABEL)
     return figure
+
+
+def _last_seen(ax: Axes, path: NDArray[Any]) -> NDArray[Any]:
+    """The last position of a path (T + 1, 2) before it leaves what a panel shows."""
+    (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+    out = np.flatnonzero(((path < (left, bottom)) | (path > (right, top))).any(axis=1))
+    return np.asarray(path[max(out[0] - 1, 0) if len(out) else -1])
 
 
 def _lengths(positions: NDArray[Any], alive: NDArray[Any] | None) -> NDArray[np.int64]:
@@ -236,8 +245,7 @@ def plot_failures(task: Task, result: RolloutResult, actor: str) -> Figure:
     table = _rows_of(result, actor)
     failed = table[~table["success"].astype(bool)]
     shown = failed if len(failed) else table
-    figure = Figure(figsize=(7.0, 4.7), layout="constrained")
-    ax = figure.add_subplot()
+    figure, ax = maze_figure(task)
     draw_walls(ax, task)
     ends, codes = shown[["final_x", "final_y"]].to_numpy(), shown["final_code"].to_numpy()
     colours = [skill_colour(int(code)) for code in codes]

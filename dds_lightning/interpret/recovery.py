@@ -26,7 +26,7 @@ import torch
 from numpy.typing import NDArray
 
 from datamodules.trajectories import Trajectories
-from dds_lightning.interpret.body import root_path
+from dds_lightning.interpret.body import root_path, to_body
 from dds_lightning.interpret.information import mutual_information
 from dds_lightning.interpret.replay import BodyStates, Replays, Skills, body_states, replay_codes, simulator
 from dds_lightning.tasks import Task
@@ -49,8 +49,10 @@ class Recovery:
         error: standard error of `accuracy`, over states.
         chance: 1 / C.
         information: mutual information in bits between code and displacement, over states and codes.
-        information_in_state: the same for what the code does to the displacement: the mean over the codes from the same
-            state is taken off first. Where a body's speed decides where it goes in H steps, this is the larger by far.
+        information_in_state: the same for `effects`. Where a body's speed decides where it goes in H steps, this is the
+            larger by far.
+        effects: (C, S, D) metres, what each code does to the displacement from each state: the mean over the codes from
+            the same state is taken off. An ant's is ahead of it and to its left, as it stands in that state.
         most: bits that both can be at most, log2 C.
         states: number of states that each code was replayed from.
         steps: H.
@@ -66,6 +68,7 @@ class Recovery:
     most: float
     states: int
     steps: int
+    effects: Floats
 
     def facts(self) -> dict[str, Any]:
         """The numbers, for a table or for JSON."""
@@ -108,8 +111,8 @@ def code_recovery(
     confusion = np.stack([(found[made.codes == k][:, None] == chosen).mean(axis=0) for k in chosen])
     by_state = hits.mean(axis=0)  # replays from one state are alike, so states are what was drawn
     error = float(by_state.std(ddof=1) / math.sqrt(len(states))) if len(states) > 1 else math.nan
-    by_code = moved.reshape(len(chosen), len(states), -1)  # (C, S, D)
-    apart = (by_code - by_code.mean(axis=0)).reshape(moved.shape)
+    by_code = moved.reshape(len(chosen), len(states), -1)
+    effects = to_body(task, by_code - by_code.mean(axis=0), states.qpos[:, 3:7])  # (C, S, D)
     return Recovery(
         codes=chosen,
         confusion=confusion,
@@ -117,10 +120,11 @@ def code_recovery(
         error=error,
         chance=1 / len(chosen),
         information=mutual_information(made.codes, moved, seed=seed),
-        information_in_state=mutual_information(made.codes, apart, seed=seed),
+        information_in_state=mutual_information(made.codes, effects.reshape(moved.shape), seed=seed),
         most=math.log2(len(chosen)),
         states=len(states),
         steps=skills.horizon,
+        effects=effects,
     ), made
 
 

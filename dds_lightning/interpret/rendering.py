@@ -22,6 +22,8 @@ from dds_lightning.tasks import Task
 
 BACKENDS = ("egl", "osmesa", "glfw")
 """Tried in this order unless `MUJOCO_GL` names one."""
+COLUMNS = 6
+"""Moments that are shown."""
 PATIENCE = 120.0
 """Seconds that one backend may take."""
 _CODE = "from dds_lightning.interpret.rendering import worker; worker()"
@@ -67,7 +69,7 @@ def render_frames(task: Task, qpos: NDArray[Any], width: int = 320, height: int 
 
 
 def plot_rendered(task: Task, frames: dict[int, NDArray[np.uint8]], every: int) -> Figure:
-    """Rendered frames side by side, a row a skill: the same moments as `strobe.plot_strobes`.
+    """Rendered frames side by side, a row a skill, a column a moment: some of those of `strobe.plot_strobes`.
 
     Args:
         task: the environment.
@@ -79,18 +81,21 @@ def plot_rendered(task: Task, frames: dict[int, NDArray[np.uint8]], every: int) 
     """
     if not frames:
         raise UserError("frames is empty: there is nothing to draw")
-    most = min(max(map(len, frames.values())), 6)
-    rows = [np.linspace(0, len(series) - 1, most).round().astype(int) for series in frames.values()]
-    figure, axes = grid(len(frames) * most, 7.0 / most, 7.0 / most * 0.75 + 0.25, columns=most)
-    for place, (code, series) in enumerate(frames.items()):
-        for column, t in enumerate(rows[place]):
-            ax = axes[place * most + column]
-            ax.imshow(series[t])
+    longest = max(map(len, frames.values()))
+    moments = np.linspace(0, longest - 1, min(longest, COLUMNS)).round().astype(int)
+    wide = 7.0 / len(moments)
+    figure, axes = grid(len(frames) * len(moments), wide, wide * 0.75 + 0.25, columns=len(moments))
+    for row, (code, series) in enumerate(frames.items()):
+        for column, t in enumerate(moments):
+            ax = axes[row * len(moments) + column]
             ax.set_axis_off()
+            if t >= len(series):  # it has fallen before
+                continue
+            ax.imshow(series[t])
             if column == 0:
-                heading(ax, code)
+                heading(ax, code, f"{0:.2f} s")
             else:
-                ax.set_title(f"{t * every * task.step_seconds:.2f} s", fontsize=8)
+                ax.set_title(f"{t * every * task.step_seconds:.2f} s", fontsize=9)
     figure.suptitle("The same frames rendered by MuJoCo", fontsize=LABEL - 1)
     return figure
 
@@ -124,14 +129,14 @@ def _render(name: str, qpos: NDArray[np.float64], width: int, height: int) -> ND
         camera = mujoco.MjvCamera()
         camera.distance, camera.azimuth, camera.elevation = {
             "kitchen": (2.4, 70.0, -30.0),
-            "antmaze": (5.0, 90.0, -50.0),
-        }.get(task.family, (2.8, 90.0, -6.0))
+            "antmaze": (4.5, 90.0, -88.0),
+        }.get(task.family, (2.5, 90.0, -6.0))
         frames = []
         for row in qpos:
             data.qpos[:] = row
             mujoco.mj_forward(model, data)
             torso = data.xpos[model.jnt_bodyid[0]]
-            camera.lookat[:] = (-0.2, 0.5, 2.0) if task.family == "kitchen" else (torso[0], torso[1], 0.7)
+            camera.lookat[:] = (-0.2, 0.5, 2.0) if task.family == "kitchen" else (torso[0], torso[1], 0.8)
             renderer.update_scene(data, camera)
             frames.append(renderer.render().copy())
     return np.stack(frames) if frames else np.zeros((0, height, width, 3), np.uint8)

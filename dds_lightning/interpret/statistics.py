@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from datamodules.relabel import Relabelled, relabel
 from datamodules.trajectories import Trajectories
+from dds_lightning.interpret.body import to_body
 from dds_lightning.tasks import Task
 from dds_lightning.tasks.layout import observation_names
 
@@ -108,7 +109,8 @@ def segment_effects(task: Task | None, segments: CodedSegments) -> pd.DataFrame:
 
     Returns:
         In a maze `dx`, `dy` (m), `distance` (m, as the crow flies), `speed` (m/s, along the path), `turn` (degrees
-        from the way of its first half to that of its second, left is positive; NaN when it stands). Of a runner `dx`
+        from the way of its first half to that of its second, left is positive; NaN when it stands); of an ant also
+        `ahead` and `left` (m), as it faces when the segment begins. Of a runner `dx`
         (m, from its velocity), `dz`, `distance`, `speed`, `turn` (degrees of pitch). Elsewhere `distance`, the norm of
         the change of what moves (in the kitchen its arm's joints, rad), and `speed`. Then `reward` (of the segment,
         undiscounted), `action` (mean |a| as a share of half the box, from its middle), `change` (mean |a' - a|
@@ -144,6 +146,9 @@ def _movement(task: Task | None, seen: Floats, lengths: NDArray[np.int64], secon
         moved = path[:, -1] - path[:, 0]
         length = np.linalg.norm(np.diff(path, axis=1), axis=-1).sum(axis=1)
         away = {"dx": moved[:, 0], "dy": moved[:, 1], "distance": np.linalg.norm(moved, axis=1)}
+        if family == "antmaze":
+            assert task is not None
+            away["ahead"], away["left"] = to_body(task, moved, seen[:, 0, 3:7]).T
         return {**away, "speed": length / seconds, "turn": _turn(path)}
     columns = slice(0, 9) if family == "kitchen" else slice(None)
     distance = np.linalg.norm(seen[:, -1, columns] - seen[:, 0, columns], axis=1)

@@ -1,4 +1,4 @@
-"""How a policy strings skills together: the way of a few episodes, and the timeline of the codes beside it."""
+"""How a policy strings skills together: the way of a few episodes, and the timeline of the codes below it."""
 
 from __future__ import annotations
 
@@ -11,17 +11,21 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from dds_lightning.errors import UserError
-from dds_lightning.interpret.drawing import LABEL, TICKS, draw_path, draw_starts, draw_walls, panel_height
+from dds_lightning.interpret.drawing import LABEL, TICKS, crop, draw_path, draw_starts, draw_walls, panel_height
 from dds_lightning.interpret.palette import ink, skill_colour
-from dds_lightning.results import RolloutResult
+from dds_lightning.results import RolloutPath, RolloutResult
 from dds_lightning.tasks import Task
 
 WIDTH = 7.0
 """Inches of a figure."""
 MAZES = 2
 """Episodes whose way is drawn."""
-ROOM = 0.025
-"""Share of a timeline's length that a piece needs to hold its number."""
+SPAN = 400
+"""Steps that are shown where there is no maze: a runner does the same again and again."""
+ROOM = 6.1
+"""Inches of a timeline."""
+SIZES = 4.5, 7.0
+"""Points of the numbers in a timeline: where not even the smallest fits into its piece, there is none."""
 
 
 def runs_of(codes: NDArray[Any]) -> list[tuple[int, int, int]]:
@@ -55,12 +59,13 @@ def best_episodes(result: RolloutResult, actor: str, count: int) -> list[int]:
 def plot_stitching(task: Task, result: RolloutResult, actor: str, episodes: int = 6) -> Figure:
     """Successful episodes with the skill in use, along the way and as a timeline (the paper's figure 4, d and h).
 
-    In a maze the first two are drawn over it, the number of a skill where it takes over. Everywhere each episode is a
-    row of the timeline. Where none succeeded, or nothing can succeed, the best by score are shown.
+    In a maze the first two are drawn over it, the number of a skill where it takes over; of a runner the height of the
+    first, if its observations were recorded. Everywhere each episode is a row of the timeline, in a maze as a whole,
+    elsewhere its first 400 steps. Where none succeeded, or nothing can succeed, the best by score are shown.
 
     Args:
         task: what was played.
-        result: table and paths, see `rollout` with ``record=True``.
+        result: table and paths, see `rollout` with ``record=True`` or ``record_observations=True``.
         actor: the contestant.
         episodes: rows of the timeline.
 
@@ -71,8 +76,10 @@ def plot_stitching(task: Task, result: RolloutResult, actor: str, episodes: int 
     table = result.episodes[result.episodes["actor"] == actor].set_index("episode")
     rows = 0.3 * len(chosen) + 0.75
     mazes = min(MAZES, len(chosen)) if task.maze_map is not None else 0
-    tall = panel_height(task, WIDTH / MAZES - 0.55) + 0.55 if mazes else 0.0
+    course = task.family == "locomotion" and result.paths[actor, chosen[0]].observations is not None
+    tall = panel_height(task, WIDTH / MAZES - 0.55) + 0.55 if mazes else 1.7 if course else 0.0
     figure = Figure(figsize=(WIDTH, rows + tall + 0.35), layout="constrained")
+    words = "the skill in use"
     if mazes:
         upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=[tall, rows]).ravel()
         for number, ax in zip(chosen, np.ravel(upper.subplots(1, MAZES, squeeze=False)), strict=False):
@@ -82,10 +89,18 @@ def plot_stitching(task: Task, result: RolloutResult, actor: str, episodes: int 
         for ax in upper.axes[mazes:]:
             ax.remove()
         timeline = lower.subplots()
+    elif course:
+        upper, timeline = figure.subplots(2, 1, height_ratios=[tall, rows], sharex=True)
+        _draw_height(upper, result.paths[actor, chosen[0]])
+        upper.set_title(f"episode {chosen[0]}", fontsize=TICKS - 1)
     else:
         timeline = figure.subplots()
-    draw_timeline(timeline, [result.paths[actor, number].codes for number in chosen], _names(task, table, chosen))
-    figure.suptitle(f"{actor}: the skill in use", fontsize=LABEL)
+    sequences = [result.paths[actor, number].codes for number in chosen]
+    if not mazes and max(map(len, sequences)) > SPAN:
+        sequences = [codes[:SPAN] for codes in sequences]
+        words += f" in the first {SPAN} steps"
+    draw_timeline(timeline, sequences, _names(task, table, chosen))
+    figure.suptitle(f"{actor}: {words}", fontsize=LABEL)
     return figure
 
 
@@ -102,8 +117,10 @@ def draw_timeline(ax: Axes, sequences: Sequence[NDArray[Any]], names: Sequence[s
         for start, length, code in runs_of(codes):
             colour = skill_colour(code)
             ax.barh(place, length, left=start, height=0.78, color=colour, edgecolor="white", linewidth=0.4)
-            if length >= ROOM * longest and code >= 0:
-                ax.text(start + length / 2, place, str(code), color=ink(colour), fontsize=7.5, ha="center", va="center")
+            size = min(55 * ROOM * length / longest, SIZES[1])  # two digits of this size are as wide as the piece
+            if size >= SIZES[0] and code >= 0:
+                middle = start + length / 2
+                ax.text(middle, place, str(code), color=ink(colour), fontsize=size, ha="center", va="center")
     ax.set_yticks(range(len(sequences)), names, fontsize=TICKS - 2)
     ax.set(xlim=(0, longest), ylim=(len(sequences) - 0.5, -0.5))
     ax.set_xlabel("step of the episode", fontsize=LABEL - 1)
@@ -117,9 +134,22 @@ def _draw_way(ax: Axes, task: Task, result: RolloutResult, actor: str, number: i
     draw_walls(ax, task)
     draw_path(ax, path, linewidth=2.0, numbers=0.75 * task.cell_size)
     draw_starts(ax, [path.positions[0]], task.cell_size, size=13)
+    crop(ax, task)
     ax.tick_params(labelsize=TICKS - 2)
     ax.xaxis.get_label().set_fontsize(LABEL - 2)
     ax.yaxis.get_label().set_fontsize(LABEL - 2)
+
+
+def _draw_height(ax: Axes, path: RolloutPath) -> None:
+    """The height of a runner's torso, coloured by the skill in use."""
+    assert path.observations is not None
+    height = np.asarray(path.observations)[: SPAN + 1, 0]
+    for start, length, code in runs_of(path.codes[:SPAN]):
+        span = np.arange(start, start + length + 1)
+        ax.plot(span, height[span], color=skill_colour(code), linewidth=2.0, solid_capstyle="round")
+    ax.set_ylabel("height of the\ntorso (m)", fontsize=LABEL - 2)
+    ax.tick_params(labelsize=TICKS - 2, labelbottom=False)
+    ax.spines[["top", "right"]].set_visible(False)
 
 
 def _names(task: Task, table: Any, chosen: list[int]) -> list[str]:

@@ -77,7 +77,8 @@ def plot_strobes(
             _draw_objects(ax, view, body, skill_colour(code))
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
         ax.tick_params(labelsize=TICKS - 2)
-        heading(ax, code, _moved(task, body, seconds))
+        falls = view.ground and len(body) < max(map(len, frames.values()))
+        heading(ax, code, _moved(task, body, seconds, falls))
         ax.set_xlabel(view.labels[0], fontsize=LABEL - 2)
         ax.set_ylabel(view.labels[1], fontsize=LABEL - 2)
         ax.yaxis.set_major_locator(MaxNLocator(nbins=5))
@@ -107,11 +108,13 @@ def body_clip(
     follows = view.ground
     low, high = _window(view, [_centred(body) if follows else body])
     tall = float(np.clip(size * (high[1] - low[1]) / (high[0] - low[0]), 1.2, 0.8 * size)) + 0.3
+    if follows:  # the ground goes on to both sides
+        half = max((high[1] - low[1]) * size / (tall - 0.3), high[0] - low[0]) / 2
+        low[0], high[0] = np.array([-half, half]) + (low[0] + high[0]) / 2
     figure = Figure(figsize=(size, tall), dpi=80)
     ax = figure.add_axes((0.0, 0.0, 1.0, (tall - 0.3) / tall))
     _scene(ax, task, view, body)
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[], xlabel="", ylabel="")
-    ax.set_adjustable("datalim" if follows else "box")  # the ground goes on to both sides
     ax.spines[:].set_visible(False)
     limbs = PolyCollection([], facecolor=skill_colour(code), edgecolor="white", linewidth=0.5, zorder=3)
     marks = LineCollection([], color=NO_SKILL, linewidth=1.0, zorder=2)
@@ -204,10 +207,11 @@ def _travel(view: View, body: BodyFrames, t: int) -> str:
     return f"{away[0]:+.2f} m" if view.ground else f"{np.linalg.norm(away):.2f} m"
 
 
-def _moved(task: Task, body: BodyFrames, seconds: float) -> str:
-    """A panel's words: how long, how far, how fast."""
+def _moved(task: Task, body: BodyFrames, seconds: float, falls: bool) -> str:
+    """A panel's words: how long, how far, how fast, or that it falls."""
     view, last = view_of(task), len(body) - 1
     away = (body.root[-1] - body.root[0])[list(view.axes)]
     far = away[0] if view.ground else np.linalg.norm(away)
     what = "hand moves" if len(body.names) else "moves"
-    return f"{what} {far:.2f} m in {last * seconds:.2g} s ({far / max(last * seconds, 1e-9):.1f} m/s)"
+    end = "then falls" if falls else f"{far / max(last * seconds, 1e-9):.1f} m/s"
+    return f"{what} {far:.2f} m in {last * seconds:.2g} s ({end})"

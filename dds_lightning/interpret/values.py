@@ -14,7 +14,7 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from dds_lightning.errors import UserError
-from dds_lightning.interpret.drawing import LABEL, draw_number, draw_walls
+from dds_lightning.interpret.drawing import LABEL, draw_number, draw_walls, maze_figure
 from dds_lightning.interpret.replay import at_rest, replay_codes, rest_states
 from dds_lightning.tasks import Task
 
@@ -117,8 +117,7 @@ def plot_value_map(
         resolution: points a cell on each axis.
         arrows: (C, 2) displacement of the chosen code from each free cell, in their order, instead of `directions`.
     """
-    figure = Figure(figsize=(7.0, 4.7), layout="constrained")
-    ax = figure.add_subplot()
+    figure, ax = maze_figure(task)
     draw_walls(ax, task)
     limits = ax.get_xlim(), ax.get_ylim()
     half = task.cell_size / 2

@@ -10,7 +10,7 @@ from pathlib import Path
 from dds_lightning.agent import DDSAgent
 from dds_lightning.errors import UserError
 from dds_lightning.files import neighbours
-from dds_lightning.interpret.atlas import CONTINUOUS, DISCRETE, Atlas, make_atlas, write_atlas
+from dds_lightning.interpret.atlas import CONTINUOUS, DISCRETE, Atlas, make_atlas, write_atlas, write_pictures
 from dds_lightning.interpret.atlas_pictures import Tell
 from dds_lightning.results import RolloutResult
 from dds_lightning.rollout import rollout, single_skills
@@ -93,6 +93,7 @@ def atlas(
     episodes: int = 5,
     against: Sequence[Path] = (),
     seed: int = 0,
+    figures: Path | None = None,
     tell: Tell = lambda words: None,
 ) -> tuple[Atlas, Path]:
     """Make and write the atlas of a place; the arguments are those of `dds atlas`.
@@ -122,6 +123,8 @@ def atlas(
     made = make_atlas(subject.agent, wanted, trajectories, result, main, singles, others=others, seed=seed, tell=tell)
     words = ["dds", "atlas", str(place), "--data", spec, "--task", wanted.name, "--seed", str(seed)]
     tell("writing the page")
+    if figures is not None:
+        write_pictures(made, figures, out.stem)
     about = _about(subject, wanted, spec, result, main)
     return made, write_atlas(made, out, about, shlex.join([*words, "--out", str(out)]))
 
@@ -141,7 +144,9 @@ def _episodes(
         players.insert(0, way(agent, agent.selection, max(episodes, 1), agent.temperature))
         main = players[0].name
     tell(f"playing {sum(player.episodes for player in players)} episodes")
-    return rollout(task, players, seed=seed, progress=False, record=True), main, SINGLE
+    seen = task.maze_map is None  # where there is no way over a maze to draw
+    result = rollout(task, players, seed=seed, progress=False, record=True, record_observations=seen)
+    return result, main, SINGLE
 
 
 def _about(

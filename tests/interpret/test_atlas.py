@@ -5,14 +5,15 @@ import re
 from html.parser import HTMLParser
 
 import numpy as np
-import pandas as pd
 import pytest
 from PIL import Image
 
 from dds_lightning.interpret import atlas_pictures, rendering
-from dds_lightning.interpret.atlas import make_atlas, write_atlas
+from dds_lightning.interpret.atlas import make_atlas, write_atlas, write_pictures
 from dds_lightning.interpret.atlas_page import page
-from dds_lightning.interpret.atlas_pictures import different_codes
+from dds_lightning.interpret.atlas_pictures import most_different
+from dds_lightning.interpret.palette import skill_colour
+from dds_lightning.interpret.png import small_png
 from dds_lightning.reports import plain
 from dds_lightning.rollout import Contestant, rollout, single_skills
 from dds_lightning.tasks import get_task
@@ -95,7 +96,7 @@ def test_every_code_has_a_row_with_all_that_is_known(maze):
 
 def test_a_maze_has_paths_values_and_timelines(maze):
     expected = {"starts_by_skill", "skills_by_start", "stitching", "trajectories", "values", "recovery", "trip"}
-    assert set(maze.pictures) == expected | {"transitions", "distances", "where", "comparison"}
+    assert set(maze.pictures) == expected | {"effects", "transitions", "distances", "diversity", "where", "comparison"}
     for picture in [*maze.pictures.values(), *maze.clips.values()]:
         with Image.open(io.BytesIO(picture.data)) as image:
             assert image.size == picture.size
@@ -103,7 +104,16 @@ def test_a_maze_has_paths_values_and_timelines(maze):
 
 
 def test_a_runner_has_strobes_and_no_maze(hopper):
-    assert set(hopper.pictures) == {"strobe", "trip", "recovery", "transitions", "distances", "where"}
+    assert set(hopper.pictures) == {
+        "strobe",
+        "trip",
+        "recovery",
+        "effects",
+        "transitions",
+        "distances",
+        "diversity",
+        "where",
+    }
     assert hopper.clips
     assert hopper.comparison is None
     assert {"alone", "value", "chosen", "dy"}.isdisjoint(hopper.table)
@@ -139,6 +149,8 @@ def test_the_page_tells_the_numbers_of_the_table(maze):
     for share in maze.table["share"]:
         assert f"{100 * share:.1f}" in read.words
     assert "continuous skills, clustered" in read.words
+    (compared,) = [t for t in page(maze).split("<table>") if "decoding error" in t]
+    assert compared.count('<th scope="col">') * 2 == compared.count("<td>") + compared.count("<th scope='row'>")
 
 
 def test_a_page_of_skills_alone_leaves_out_what_was_not_measured(hopper):
@@ -166,10 +178,27 @@ def test_facts_are_plain_json(maze, hopper):
     assert plain(hopper.facts())["comparison"] is None
 
 
-def test_pictures_are_of_the_commonest_code_and_of_those_that_differ_most():
-    table = pd.DataFrame({"code": range(4), "share": [0.4, 0.2, 0.2, 0.2], "dx": [1.0, 1.0, 1.1, -5.0], "dy": 0.0})
-    assert different_codes(table, np.arange(4), 2) == [0, 3]
-    assert different_codes(table, np.array([1, 2]), 5) == [1, 2]
+def test_bodies_are_shown_in_the_state_in_which_skills_differ_most():
+    ways = np.zeros((3, 2, 5, 1))  # three codes, two states, five moments, one position
+    t = np.arange(5)
+    ways[0, 1, :, 0], ways[1, 1, :, 0], ways[2, 1, :, 0] = t, 1.1 * t, -t
+    state, codes = most_different(ways + 7.0, np.array([0.5, 0.3, 0.2]), 2)
+    assert (state, codes.tolist()) == (1, [0, 2])  # from state 0 all do the same
+    assert most_different(ways, np.array([0.2, 0.3, 0.5]), 2)[1].tolist() == [1, 2]  # the commonest, then the farthest
+    ended = ways.copy()
+    ended[2, :, 1:] = np.nan  # what ends at once cannot differ
+    assert most_different(ended, np.array([0.5, 0.3, 0.2]), 2)[1].tolist() == [0, 1]
+    assert most_different(ways, np.array([0.5, 0.3, 0.2]), 9)[1].tolist() == [0, 1, 2]
+
+
+def test_pictures_are_written_small_and_named_after_the_page(maze, tmp_path):
+    paths = write_pictures(maze, tmp_path / "new", "mine")
+    assert sorted(path.name for path in paths) == sorted(f"mine-{n.replace('_', '-')}.png" for n in maze.pictures)
+    assert sorted(paths) == sorted((tmp_path / "new").iterdir())
+    for path, picture in zip(paths, maze.pictures.values(), strict=True):
+        assert path.stat().st_size < len(picture.data)
+        with Image.open(path) as image:
+            assert (image.size, image.mode) == (picture.size, "P")
 
 
 def test_without_a_driver_there_are_no_rendered_pictures():
@@ -192,3 +221,20 @@ def test_a_kitchen_has_the_way_of_its_arm(monkeypatch):
     assert {"strobe", "where", "recovery"} <= set(made.pictures)
     assert made.table["distance"].notna().any()
     assert "rad/s" in Reader(page(made)).words
+
+
+def test_a_small_picture_keeps_the_colours_that_mean_something():
+    rng = np.random.default_rng(0)
+    pixels = rng.integers(0, 256, (200, 300, 3)).astype(np.uint8)  # a photograph with every colour
+    pixels[:9, :9] = [int(skill_colour(1)[i : i + 2], 16) for i in (1, 3, 5)]
+    pixels[20:, 100:] = 255
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, format="png")
+    with Image.open(io.BytesIO(small_png(file.getvalue()))) as image:
+        small = np.asarray(image.convert("RGB"))
+    np.testing.assert_array_equal(small[:9, :9], pixels[:9, :9])
+    np.testing.assert_array_equal(small[20:, 100:], 255)
+    few = small_png(file.getvalue(), limit=1)  # as small as it gets
+    assert len(few) < len(small_png(file.getvalue()))
+    with Image.open(io.BytesIO(few)) as image:
+        assert len(image.getcolors()) <= 64

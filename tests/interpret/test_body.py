@@ -9,7 +9,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgba
 
 from dds_lightning.errors import UserError
-from dds_lightning.interpret.body import body_frames, root_path
+from dds_lightning.interpret.body import body_frames, path_names, root_path, to_body
 from dds_lightning.interpret.palette import skill_colour
 from dds_lightning.interpret.replay import simulator
 from dds_lightning.interpret.strobe import body_clip, plot_strobes
@@ -51,6 +51,17 @@ def test_the_way_of_a_body_is_that_of_its_root():
     path = root_path(HOPPER, None, qpos)
     np.testing.assert_array_equal(path[1, :2], [[0, 1], [1, 2]])
     assert np.isnan(path[1, 2]).all()
+
+
+def test_an_ant_moves_ahead_and_to_its_left_wherever_it_faces():
+    half = np.sqrt(0.5)
+    faces_y = np.array([half, 0.0, 0.0, half])  # turned a quarter to the left
+    away = np.array([[0.0, 2.0], [-1.0, 0.0]])
+    np.testing.assert_allclose(to_body(ANT, away, faces_y), [[2.0, 0.0], [0.0, 1.0]], atol=1e-12)
+    np.testing.assert_allclose(to_body(ANT, away, np.array([1.0, 0, 0, 0])), away)
+    np.testing.assert_array_equal(to_body(HOPPER, away, faces_y), away)
+    assert path_names(ANT) == ("ahead of the ant", "to its left")
+    assert path_names(HOPPER) == ("along x", "along z")
 
 
 def bodies(ax):

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from dds_lightning.errors import UserError
-from dds_lightning.interpret.charts import plot_comparison, plot_recovery, plot_round_trip
-from dds_lightning.interpret.comparison import cluster_skills, compare_recovery
+from dds_lightning.interpret.charts import plot_comparison, plot_effects, plot_recovery, plot_round_trip
+from dds_lightning.interpret.comparison import cluster_skills, compare_recovery, decoding_error
 from dds_lightning.interpret.information import mutual_information
 from dds_lightning.interpret.recovery import code_recovery, displacements, encode_replays, round_trip
 from dds_lightning.interpret.replay import Replays, rest_states, simulator
@@ -37,8 +37,15 @@ def test_clear_skills_are_all_recovered_and_tell_where_they_lead(env, states):
     assert 1.3 < found.information <= 2.0
     assert 1.3 < found.information_in_state <= 2.0
     assert (found.states, found.steps, len(made.codes)) == (12, 6, 48)
+    assert found.effects.shape == (4, 12, 2)
+    np.testing.assert_allclose(found.effects.mean(axis=0), 0.0, atol=1e-12)  # less the mean of all from a state
+    assert (np.diag(found.effects.mean(axis=1) @ Compass.ways.numpy().T) > 0).all()
+    ax = plot_effects(MAZE, found).axes[0]
+    assert [text.get_text() for text in ax.texts] == ["0", "1", "2", "3"]
+    np.testing.assert_allclose(ax.texts[2].xy, 100 * found.effects[2].mean(axis=0))
+    assert f"{found.information_in_state:.1f} bits of 2" in ax.get_title()
     title = plot_recovery(found).axes[0].get_title()
-    assert title == "from any state: recovered in 100% (chance 25%)"
+    assert title == "From any state: recovered in 100% (chance 25%)"
 
 
 def test_skills_that_do_the_same_are_at_chance_and_tell_nothing(env, states):
@@ -168,6 +175,44 @@ def test_seeds_of_both_kinds_are_compared_on_the_same_states(data):
     assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == ["discrete", "continuous"]
     dots = [line for line in figure.axes[0].lines if line.get_marker() == "o"]
     np.testing.assert_allclose(dots[0].get_xdata(), 100 * table["own_accuracy"][:2])
-    assert len(figure.axes) == 3
+    assert len(figure.axes) == 4
+    assert (table["decoded"] > 0).all()
+    assert table["decoded_own"].notna().tolist() == [False, False, True]
     with pytest.raises(UserError, match="clusters is missing"):
         compare_recovery(MAZE, data, models[2:])
+
+
+def test_the_decoding_error_is_that_of_the_actions_drawn_under_what_was_found(data):
+    class Exact:
+        """Decodes what the data did at x, of which the code says nothing."""
+
+        horizon, num_skills, discrete, device = 5, 3, True, torch.device("cpu")
+
+        def __init__(self, off):
+            self.off = off
+            self.hparams = {"observation_dim": 4, "action_dim": 2}
+            self.known = {row.tobytes(): a for row, a in zip(data.observations[rows], data.actions, strict=True)}
+
+        def eval(self):
+            return self
+
+        def encode(self, observations, actions):
+            return torch.zeros(len(observations), dtype=torch.int64)
+
+        def decode(self, observations, codes, noise_scale=None, generator=None):
+            assert noise_scale == 1.0
+            return torch.from_numpy(np.stack([self.known[row.tobytes()] for row in observations.numpy()])) + self.off
+
+    steps = np.arange(data.num_steps)
+    rows = steps + data.episode_of(steps)
+    assert decoding_error(Exact(0.0), data) == 0.0
+    assert decoding_error(Exact(0.3), data) == pytest.approx(0.3, rel=1e-5)
+
+
+def test_a_continuous_model_is_decoded_under_its_own_vectors_or_under_centres(data):
+    skill = tiny_skill(MAZE, bottleneck="gaussian", noise_scale=1.0)
+    one, many = (decoding_error(cluster_skills(skill, data, k), data) for k in (1, 40))
+    own = decoding_error(skill, data)
+    assert 0 < own < 2
+    assert abs(many - own) < abs(one - own) + 0.05
+    assert decoding_error(skill, data) == own  # the same draws

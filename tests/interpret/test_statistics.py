@@ -69,6 +69,15 @@ def test_a_left_turn_is_positive_and_a_body_that_stands_has_none():
     assert np.isnan(effects["turn"][1])
 
 
+def test_an_ant_that_faces_y_and_moves_along_y_moves_ahead():
+    ant = get_task("antmaze-umaze")
+    seen = np.zeros((H + 1, 29), np.float32)
+    seen[:, 1] = 0.1 * np.arange(H + 1)
+    seen[:, 3] = seen[:, 6] = np.sqrt(0.5)  # a quarter turn to the left
+    effects = segment_effects(ant, coded(ant, seen, [0])).iloc[0]
+    np.testing.assert_allclose(effects[["dx", "dy", "ahead", "left"]].astype(float), [0, 0.4, 0.4, 0], atol=1e-6)
+
+
 def test_a_runner_moves_by_its_velocity_and_turns_by_its_pitch():
     seen = np.zeros((H + 1, 11), np.float32)
     seen[:, 5] = 2.0  # x velocity

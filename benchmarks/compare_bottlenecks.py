@@ -1,0 +1,147 @@
+"""Discrete against continuous skills: the same data, steps and sizes, several seeds, the same measurements.
+
+    python benchmarks/compare_bottlenecks.py [--task pointmaze-large-diverse] [--data local:DIR] [--skills 4]
+        [--seeds 3] [--steps 2500] [--out runs/bottlenecks]
+
+For each seed trains a codebook of K skills and a Gaussian bottleneck of as many dimensions, puts the continuous skills
+into K clusters, and measures both alike on the episodes that the training left out. Prints means over seeds with their
+standard deviations, and leaves `models-K.csv` (a row a model), `table-K.csv` and `comparison-K.png` in --out. Without
+--data 200,000 steps are collected there first. A training takes about three minutes of one core; those that are done
+are found done, and one that was stopped goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from rich.console import Console
+
+from dds_lightning.interpret import plot_comparison, png_bytes, small_png
+from dds_lightning.interpret.atlas import CONTINUOUS, DISCRETE
+from dds_lightning.reports import table as text_table
+from dds_lightning.stages import Done, Stages
+from dds_lightning.tasks import Task, get_task
+
+DIM = 64
+"""D, of codes and of continuous skills."""
+PRECISION = "bf16-mixed"
+"""Of training; half again as fast as float32 on a processor with matrix units."""
+STATES = 64
+"""From which every code is replayed, and segments of each code's round trip."""
+MEASURES = (
+    ("own_accuracy", "found again in own states, %", 100.0),
+    ("own_control", "  the same, another code held, %", 100.0),
+    ("accuracy", "recovered from any state, %", 100.0),
+    ("chance", "  chance, %", 100.0),
+    ("information_in_state", "bits between code and displacement, in a state", 1.0),
+    ("information", "bits between code and displacement, over all", 1.0),
+    ("most", "  possible", 1.0),
+    ("decoded", "error of decoded actions under codes", 1.0),
+    ("decoded_own", "  under each segment's own vector", 1.0),
+)
+"""Columns of `compare_recovery`, what the table calls them, and a factor."""
+
+
+def data_of(stages: Stages, task: Task, given: str | None) -> tuple[str, list[Done]]:
+    """The data that were given, or collected data, as SOURCE:NAME."""
+    if given is not None:
+        return given, []
+
+    def work(folder: Path, resuming: bool) -> dict[str, Any]:
+        from datamodules.collect.collectors import collect
+
+        return {"data": collect(task, 200_000, 0, folder, dataset_id=task.name, overwrite=True)}
+
+    done = stages.do("data", f"data: 200,000 steps of {task.name}", {"task": task.name}, [], work)
+    return f"local:{done.outputs['data']}", [done]
+
+
+def train(stages: Stages, name: str, task: Task, spec: str, reads: list[Done], own: list[str], steps: int) -> Path:
+    """The checkpoint of one model; trained unless it was before."""
+    from dds_lightning.training.fitting import StageCLI, quieten
+
+    quieten()
+    words = [*own, f"--data.task={task.name}", f"--data.data={spec}", f"--model.skill_dim={DIM}"]
+    words += [f"--trainer.max_steps={steps}", f"--trainer.precision={PRECISION}"]
+
+    def work(folder: Path, resuming: bool) -> dict[str, Any]:
+        places = [f"--checkpoint.dirpath={folder}", f"--trainer.default_root_dir={folder}"]
+        kept = folder / "last.ckpt"
+        again = [f"--ckpt_path={kept}"] if resuming and kept.is_file() else []
+        fit = ["fit", "--config", f"{task.family}/skill.yaml", *words, *places, "--trainer.enable_model_summary=false"]
+        return {"checkpoint": Path(StageCLI("skill", [*fit, *again]).execute().data["checkpoint"])}
+
+    done = stages.do(name, f"{name}: {steps:,} steps", {"words": sorted(words)}, reads, work)
+    return done.outputs["checkpoint"]
+
+
+def measure(task: Task, spec: str, seed: int, skills: int, checkpoints: dict[str, Path], console: Console) -> Any:
+    """Both models of a seed on the episodes that neither was trained on; a row each."""
+    from datamodules import SegmentDataModule
+    from dds_lightning.interpret.comparison import compare_recovery
+    from dds_lightning.skill import SkillModule
+
+    models = [(name, SkillModule.load(path)) for name, path in checkpoints.items()]
+    data = SegmentDataModule(task.name, spec, seed=seed)
+    data.setup()
+    held_out = data.trajectories.select(data.validation_episodes)
+    made = compare_recovery(
+        task, held_out, models, skills, STATES, seed, lambda name: console.print(f"measuring seed {seed}: {name}")
+    )
+    return made.assign(seed=seed)
+
+
+def summary(models: pd.DataFrame) -> pd.DataFrame:
+    """A row a measure, a column a kind: mean over seeds, and standard deviation where there are several."""
+    rows = []
+    for column, words, factor in MEASURES:
+        row = {"measure": words}
+        for name, part in models.groupby("model", sort=False):
+            values = factor * part[column].dropna()
+            spread = f" ± {values.std(ddof=1):.3g}" if len(values) > 1 else ""
+            row[str(name)] = f"{values.mean():.3g}{spread}" if len(values) else "–"
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", default="pointmaze-large-diverse")
+    parser.add_argument("--data", help="SOURCE:NAME; without it data are collected")
+    parser.add_argument("--skills", type=int, default=4, help="K")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--steps", type=int, default=2500)
+    parser.add_argument("--out", type=Path, default=Path("runs/bottlenecks"))
+    wanted = parser.parse_args()
+    task, console = get_task(wanted.task), Console(stderr=True)
+    stages = Stages(wanted.out, console)
+    spec, reads = data_of(stages, task, wanted.data)
+    parts = []
+    for seed in range(wanted.seeds):
+        seeds = [f"--seed_everything={seed}", f"--data.seed={seed}"]
+        kinds = {
+            DISCRETE: (f"vq{wanted.skills}", ["--model.bottleneck=vq", f"--model.num_skills={wanted.skills}"]),
+            CONTINUOUS: ("gaussian", ["--model.bottleneck=gaussian"]),
+        }
+        checkpoints = {
+            kind: train(stages, f"{name}-seed{seed}", task, spec, reads, [*seeds, *words], wanted.steps)
+            for kind, (name, words) in kinds.items()
+        }
+        parts.append(measure(task, spec, seed, wanted.skills, checkpoints, console))
+    models = pd.concat(parts, ignore_index=True)
+    table = summary(models)
+    models.to_csv(wanted.out / f"models-{wanted.skills}.csv", index=False)
+    table.to_csv(wanted.out / f"table-{wanted.skills}.csv", index=False)
+    title = f"{task.name}: K = {wanted.skills}, D = {DIM}, {wanted.steps:,} steps, {wanted.seeds} seeds"
+    Console().print(text_table(table, title))
+    path = wanted.out / f"comparison-{wanted.skills}.png"
+    path.write_bytes(small_png(png_bytes(plot_comparison(models))))
+    print(path)
+
+
+if __name__ == "__main__":
+    main()
