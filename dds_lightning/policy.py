@@ -254,7 +254,7 @@ class PolicyModule(StageModule):
         h = self.hparams
         log_pi = self.actor(features).log_softmax(dim=-1).gather(-1, codes[:, None]).squeeze(-1)
         if h.awr == "closed_form":
-            return losses.awr(log_pi, torch.ones_like(log_pi)), {}
+            return losses.awr(log_pi, torch.ones_like(log_pi)), {"clipped_share": log_pi.new_zeros(())}
         weights = losses.awr_weights(advantages.detach(), h.alpha, h.weight_clip)
         info = {
             "clipped_share": (weights >= h.weight_clip).float().mean(),
