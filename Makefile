@@ -48,7 +48,7 @@ audit: $(VENV)/.installed  ## look every pinned version up among known vulnerabi
 	$(BIN)/python -m pip install --quiet 'pip-audit>=2.7' --constraint constraints.txt
 	$(BIN)/pip-audit --requirement constraints.txt --no-deps --disable-pip --strict --progress-spinner off
 
-notebooks: $(VENV)/.notebooks  ## execute all ten notebooks anew, under 45 minutes
+notebooks: $(VENV)/.notebooks  ## execute all notebooks anew, under 45 minutes
 	$(BIN)/python notebooks/execute.py
 
 figures: $(VENV)/.installed  ## draw the figures of all shipped checkpoints anew

@@ -50,9 +50,9 @@ def commands_of(script):
     return [shlex.split(line, comments=True)[1:] for line in lines if line.startswith("dds ")]
 
 
-def test_there_are_ten_notebooks_and_each_has_its_script_and_its_row():
+def test_each_notebook_has_a_number_its_script_and_its_row():
     stems = [script.stem for script in SCRIPTS]
-    assert [stem[:2] for stem in stems] == [f"{number:02}" for number in range(10)]
+    assert len({stem[:2] for stem in stems}) == len(stems) >= 9
     assert [path.stem for path in sorted(HERE.glob("*.ipynb"))] == stems
     linked = re.findall(r"^\| \[.*?\]\((.*?)\.ipynb\)", (HERE / "README.md").read_text(), flags=re.MULTILINE)
     assert linked == stems

@@ -86,7 +86,8 @@ def _progress(total: int) -> Iterator[Callable[[str], None]]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-    console = Console(stderr=True, force_jupyter=False)  # lines there too, not a display for each
+    notebook = Console().is_jupyter  # no terminal, whatever its streams say: plain lines are what it can show
+    console = Console(stderr=True, force_jupyter=False, force_terminal=False if notebook else None)
     columns = (SpinnerColumn(), BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         line = bar.add_task("atlas", total=total)
