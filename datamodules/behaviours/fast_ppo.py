@@ -57,8 +57,12 @@ class NumpyActorCritic:
         self.actor, self.actor_gradient = _pairs(views[1 : 1 + count]), _pairs(slopes[1 : 1 + count])
         self.critic, self.critic_gradient = _pairs(views[1 + count :]), _pairs(slopes[1 + count :])
 
-    def compute_gradient(self, batch: Minibatch, clip: float, value_weight: float) -> None:
-        """Fill `gradient` with that of PPO's loss: clipped surrogate + value_weight x mean squared value error."""
+    def compute_gradient(self, batch: Minibatch, clip: float, value_weight: float, entropy_weight: float = 0.0) -> None:
+        """Fill `gradient` with that of PPO's loss.
+
+        Clipped surrogate + value_weight x mean squared value error - entropy_weight x the Gaussian's entropy, which
+        is the sum of `log_std` and a constant.
+        """
         rows = len(batch.returns)
         hidden_pi, mean = _forward(self.actor, batch.observations)
         hidden_v, values = _forward(self.critic, batch.observations)
@@ -70,14 +74,14 @@ class NumpyActorCritic:
         gain = batch.advantages
         active = np.where(gain > 0, ratio < 1 + clip, ratio > 1 - clip)
         weight = np.where(active, -gain * ratio / rows, 0.0).astype(np.float32)[:, None]  # d loss / d log-probability
-        self.log_std_gradient[:] = (weight * (z * z - 1.0)).sum(axis=0)
+        self.log_std_gradient[:] = (weight * (z * z - 1.0)).sum(axis=0) - entropy_weight
         _backward(self.actor, self.actor_gradient, batch.observations, hidden_pi, weight * z * inverse)
         error = (2 * value_weight / rows) * (values - batch.returns[:, None])
         _backward(self.critic, self.critic_gradient, batch.observations, hidden_v, error)
 
 
 class FastPPO(PPO):
-    """PPO whose `train` runs in NumPy; for Gaussian policies of two tanh networks, without entropy bonus."""
+    """PPO whose `train` runs in NumPy; for Gaussian policies of two tanh networks."""
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -113,7 +117,7 @@ class FastPPO(PPO):
                 advantages = batch.advantages
                 advantages -= advantages.mean()
                 advantages /= advantages.std(ddof=1) + 1e-8
-                numbers.compute_gradient(batch, clip, self.vf_coef)
+                numbers.compute_gradient(batch, clip, self.vf_coef, self.ent_coef)
                 gradient = numbers.gradient
                 norm = float(np.sqrt(gradient @ gradient))
                 if norm > self.max_grad_norm:

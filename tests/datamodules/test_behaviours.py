@@ -244,7 +244,8 @@ def tiny(name):
     return replace(recipe, environments=2, steps=256, settings={**recipe.settings, "n_steps": 64}, coarse_steps=128)
 
 
-def test_numpy_gradient_is_autograds():
+@pytest.mark.parametrize("entropy_weight", [0.0, 0.01])
+def test_numpy_gradient_is_autograds(entropy_weight):
     pytest.importorskip("stable_baselines3")
     from datamodules.behaviours.fast_ppo import Minibatch
     from datamodules.behaviours.learner import build_learner, export_policy
@@ -257,13 +258,14 @@ def test_numpy_gradient_is_autograds():
     with torch.no_grad():
         _, log_probs, _ = policy.evaluate_actions(torch.from_numpy(observations), torch.from_numpy(actions))
     batch = Minibatch(observations, actions, log_probs.numpy() + 0.3 * draw(64), draw(64), draw(64))
-    numbers.compute_gradient(batch, 0.2, 0.25)
+    numbers.compute_gradient(batch, 0.2, 0.25, entropy_weight)
 
-    values, log_probs, _ = policy.evaluate_actions(torch.from_numpy(observations), torch.from_numpy(actions))
+    values, log_probs, entropy = policy.evaluate_actions(torch.from_numpy(observations), torch.from_numpy(actions))
     ratio = torch.exp(log_probs - torch.from_numpy(batch.log_probs))
     gain = torch.from_numpy(batch.advantages)
     surrogate = torch.min(gain * ratio, gain * ratio.clamp(0.8, 1.2)).mean()
     loss = 0.25 * torch.nn.functional.mse_loss(values.flatten(), torch.from_numpy(batch.returns)) - surrogate
+    loss = loss - entropy_weight * entropy.mean()
     policy.zero_grad()
     loss.backward()
     pairs = [(numbers.log_std_gradient, policy.log_std)]
