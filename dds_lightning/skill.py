@@ -62,7 +62,9 @@ class SkillModule(StageModule):
         kl_weight: weight of the KL term of the Gaussian bottleneck.
         codebook_init: ``kmeans`` of encodings before the first step, ``uniform`` in +-1/K (VQ-VAE), or ``normal``.
         codebook_ema: decay of an EMA codebook; null trains the vectors by the codebook loss.
-        restart_threshold: a code used less than this share of 1/K is dead and restarts from the data; 0 never.
+        restart_threshold: a code used less than this share of 1/K is dead and restarts from the data; 0 never. With
+            ``init_from`` take 0 to keep a policy that learnt with the old codes: what the new data do not use would
+            restart too, and mean something else.
         restart_every: steps between two looks for dead codes.
         restart_until: share of the training after which no code is moved any more, so that decoding settles.
         lr: Adam's learning rate.

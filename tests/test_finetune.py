@@ -157,6 +157,26 @@ def test_running_averages_that_the_checkpoint_lacks_begin_at_its_vectors(starts)
     assert torch.equal(module.bottleneck.ema_count, torch.ones(4))
 
 
+class Alike(Segments):
+    """One and the same segment, over and over: a single code is in use."""
+
+    def train_dataloader(self):
+        one = {
+            name: rows[:1].expand(32, *rows.shape[1:]) for name, rows in super().train_dataloader().dataset[0].items()
+        }
+        return DataLoader([one] * 20, batch_size=None)
+
+
+@pytest.mark.parametrize("threshold", [0.0, 1.5])
+def test_codes_that_new_data_do_not_use_stay_only_without_restarts(starts, threshold):
+    restart = {"restart_threshold": threshold, "restart_every": 1, "restart_until": 1.0, "dropout": 0.0}
+    module = skill(init_from=str(starts / "skill.ckpt"), lr_scale={"encoder": 1e-6}, **restart)
+    before = module.bottleneck.vectors.detach().clone()
+    fit(module, Alike(), 5)
+    moved = (module.bottleneck.vectors.detach() != before).any(dim=1)
+    assert (int(moved.sum()) == 1) == (threshold == 0)
+
+
 @pytest.mark.parametrize("name", ["skill.ckpt", "agent"])
 def test_a_start_in_one_line_takes_the_checkpoints_settings_but_not_how_it_was_made_itself(starts, tmp_path, name):
     module = SkillModule.starting_from(starts / name, trainable="decoder", lr=2e-3, lr_scale={"decoder": 0.5})
