@@ -51,7 +51,7 @@ from dds_lightning.rollout import Contestant, rollout
 
 # %% tags=["parameters"] quick={"DATA_STEPS": 4000, "SKILL_STEPS": 4, "POLICY_STEPS": 4, "CLONE_STEPS": 4, "PLAYED": 1}
 DATA_STEPS = 80_000
-SKILL_STEPS = 2_500
+SKILL_STEPS = 4_000
 POLICY_STEPS = 4_000
 CLONE_STEPS = 2_000
 PLAYED = 10  # episodes
@@ -146,12 +146,18 @@ plot_strobes(task, frames, every=13, title="one second of a medium episode (0) a
 #
 # **Third difference: the amount of training.** The paper's settings are shipped to the letter (`--preset paper`); the
 # skills alone took two and a half hours on an RTX 4090, by the paper's own account. The preset of this body is made
-# for two CPU cores (`--preset locomotion`), and this notebook takes a third of that: fewer steps at larger rates, a
-# layer less in the encoder, narrower networks in the policy.
+# for two CPU cores (`--preset locomotion`), and this notebook takes half of its steps or less, at larger rates, with a
+# layer less in the encoder and narrower networks in the policy.
+#
+# A recipe this small sits near an edge, so two things are different on purpose: 32 skills instead of 16, and actions
+# without noise. With 16 skills and 2,500 steps two trials scored 101 and 54. In the second one the codes did not part
+# the two gaits (78 % of the segments lay in a code's commoner gait, in the first trial 98 %), and then nobody can
+# choose between them. One seed is no result.
 
 # %%
 RECIPE = {
     "skill.trainer.max_steps": SKILL_STEPS,
+    "skill.model.num_skills": 32,
     "skill.model.encoder_layers": 1,
     "skill.model.lr": 1e-3,
     "policy.trainer.max_steps": POLICY_STEPS,
@@ -183,7 +189,7 @@ pd.DataFrame({name: [str(recipe.get(key, "-")) for key in SHOWN] for name, recip
 # %%
 RUN = RUNS / f"run-{SEED}"
 words = [f"run {task.name} --data {DATA} --out {RUN} --seed {SEED} --clone_steps {CLONE_STEPS}"]
-words += [f"--episodes {PLAYED} --episodes_per_skill 1 --evaluate_every 0"]
+words += [f"--episodes {PLAYED} --episodes_per_skill 1 --evaluate_every 0 --selection greedy --noise_scale 0"]
 for stage, steps in (("skill", SKILL_STEPS), ("policy", POLICY_STEPS)):
     validate = f"--{stage}.trainer.val_check_interval={max(steps // 5, 1)}"
     words += [validate, f"--{stage}.trainer.log_every_n_steps=20", f"--{stage}.trainer.enable_progress_bar=false"]
@@ -242,9 +248,9 @@ figure
 # %% [markdown]
 # ## Evaluate
 #
-# **The fourth thing** is how often and how one plays. The preset samples skills and halves the decoder's
-# noise; the last checkpoint counts, not the best of several. Everybody plays the same starts. (The paper does not say
-# how many episodes; 20 are usual, ten are what time allows here.)
+# **The fourth thing** is how, and how often, one plays. Skills are chosen greedily and actions drawn without noise; the
+# last checkpoint counts, not the best of several. Everybody plays the same starts. (20 episodes are usual, ten are
+# what time allows here.)
 
 # %%
 told = json.loads(dds(f"{COMMAND} --json"))
@@ -341,9 +347,6 @@ checks.round(1)
 
 # %% [markdown]
 # ## Exercises
-#
-# This reduced recipe depends on its seed: with seed 1 the 16 codes mix the two gaits (78 % of a code from one of them,
-# with seed 0 98 %), and the agent scored 53.8 greedy, below its clone's 55.7. The bounds above are for seed 0.
 #
 # 1. `SEED = 1`, then 2: by how much does the score move, and is "mean ± standard deviation over three seeds" the same
 #    thing as the ± in the table above?
