@@ -105,7 +105,7 @@ def test_a_whole_run_from_a_published_layout_to_the_report(name, layout, variant
     assert (f"evaluating in {variant} ({env_id})" in told) == (layout == "minari")
 
     how, preset = said["protocol"], run_defaults(task.family)
-    noise = preset["noise_scale"] or 1.0
+    noise = 1.0 if preset["noise_scale"] is None else preset["noise_scale"]
     assert (how["task"], how["environment"], how["checkpoint"]) == (variant, env_id, "last")
     assert (how["episodes"], how["seed"], how["noise_scale"], how["sampler"], how["horizon"]) == (
         2,
