@@ -17,7 +17,7 @@
 # made on the spot and looked at, all stages of the method with a reduced recipe, the evaluation in the real simulator,
 # and, scored in the same way, the shipped agent of full size beside the paper's number.
 #
-# **Time:** five to six minutes on two CPU cores. No network, no GPU, no graphics driver.
+# **Time:** four to five minutes on two CPU cores. No network, no GPU, no graphics driver.
 #
 # A number is reproduced when somebody else gets it by doing the same. So first: what is "the same"? Four things decide
 # a score before any learning does, and three of them differ here. They are named as they come.
