@@ -18,7 +18,7 @@
 # what is frozen does not change by a bit; a policy that gets a new goal while its skills stay as they are; a robot with
 # other sensors, and which weights still fit it; and what all of this saves against learning from nothing.
 #
-# **Time:** five to six minutes on two CPU cores. No network, no GPU, no graphics driver.
+# **Time:** four to five minutes on two CPU cores. No network, no GPU, no graphics driver.
 #
 # Skills say how a body moves, the policy says where to. A new maze, goal or driver changes one of the two much more
 # than the other, so it should be possible to keep what did not change. Whether it is, is a question to measurements.
