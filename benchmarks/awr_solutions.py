@@ -21,7 +21,8 @@ from torch import Tensor
 from datamodules.relabel import Relabelled
 from dds_lightning import DDSAgent, PolicyModule, SkillModule, losses
 from dds_lightning.errors import UserError
-from dds_lightning.rollout import Contestant, rollout
+from dds_lightning.rollout.actors import Contestant
+from dds_lightning.rollout.play import rollout
 from dds_lightning.study.findings import Findings
 
 

@@ -19,10 +19,10 @@ from typing import Any
 import pandas as pd
 from rich.console import Console
 
+from dds_lightning.console.reports import table as text_table
 from dds_lightning.interpret import plot_comparison, png_bytes, small_png
-from dds_lightning.interpret.atlas import CONTINUOUS, DISCRETE
-from dds_lightning.reports import table as text_table
-from dds_lightning.stages import Done, Stages
+from dds_lightning.interpret.atlas.build import CONTINUOUS, DISCRETE
+from dds_lightning.saving.run_directory import Done, Stages
 from dds_lightning.tasks import Task, get_task
 
 DIM = 64
@@ -61,7 +61,7 @@ def data_of(stages: Stages, task: Task, given: str | None) -> tuple[str, list[Do
 
 def train(stages: Stages, name: str, task: Task, spec: str, reads: list[Done], own: list[str], steps: int) -> Path:
     """The checkpoint of one model; trained unless it was before."""
-    from dds_lightning.training.fitting import StageCLI, quieten
+    from dds_lightning.training.stage_cli import StageCLI, quieten
 
     quieten()
     words = [*own, f"--data.task={task.name}", f"--data.data={spec}", f"--model.skill_dim={DIM}"]
@@ -81,7 +81,7 @@ def train(stages: Stages, name: str, task: Task, spec: str, reads: list[Done], o
 def measure(task: Task, spec: str, seed: int, skills: int, checkpoints: dict[str, Path], console: Console) -> Any:
     """Both models of a seed on the episodes that neither was trained on; a row each."""
     from datamodules import SegmentDataModule
-    from dds_lightning.interpret.comparison import compare_recovery
+    from dds_lightning.interpret.measure.comparison import compare_recovery
     from dds_lightning.skill import SkillModule
 
     models = [(name, SkillModule.load(path)) for name, path in checkpoints.items()]

@@ -36,7 +36,7 @@ def main() -> None:
 
     from datamodules.collect.collectors import collect
     from dds_lightning.cli import main as dds
-    from dds_lightning.publishing import load_published
+    from dds_lightning.saving.published import load_published
     from dds_lightning.tasks import get_task
 
     for place in wanted.checkpoints or sorted(path.parent for path in Path("checkpoints").glob("*/config.yaml")):

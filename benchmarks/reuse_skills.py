@@ -35,8 +35,9 @@ from matplotlib.figure import Figure
 from datamodules import RelabeledDataModule, SegmentDataModule, collect_pointmaze
 from dds_lightning import PolicyModule, SkillModule
 from dds_lightning.callbacks import RolloutEvaluation
-from dds_lightning.training.fitting import quieten
-from dds_lightning.training.trainer import RollingCheckpoint, trainer_settings
+from dds_lightning.callbacks.rolling import RollingCheckpoint
+from dds_lightning.training.stage_cli import quieten
+from dds_lightning.training.trainer import trainer_settings
 
 MEDIUM, LARGE = "pointmaze-medium-diverse", "pointmaze-large-diverse"
 DATA_STEPS = {MEDIUM: 100_000, LARGE: 60_000}

@@ -16,7 +16,8 @@ import torch
 
 from datamodules import SegmentDataModule, collect_pointmaze, load_trajectories
 from dds_lightning import DDSAgent, SkillModule, get_task
-from dds_lightning.rollout import Contestant, rollout
+from dds_lightning.rollout.actors import Contestant
+from dds_lightning.rollout.play import rollout
 
 CHECKPOINT = Path("checkpoints/pointmaze-large")
 WAYS = {

@@ -10,11 +10,11 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from datamodules.sources.belonging import refuse_other_task
 from datamodules.sources.fetch import d4rl_root
 from datamodules.sources.hdf5 import check_array, member, open_hdf5, read_array, read_rows
 from datamodules.sources.metadata import read_metadata
 from datamodules.sources.minari import minari_root
+from datamodules.sources.plausibility import refuse_other_task
 from datamodules.storage import read_arrays
 from datamodules.trajectories import DataError
 from dds_lightning.errors import UserError

@@ -26,10 +26,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from datamodules.kept_codes import KeptCodes
+from datamodules.partial_codes import KeptCodes
 from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError
-from dds_lightning.files import refuse_newer, written_whole
+from dds_lightning.saving.files import refuse_newer, written_whole
 from dds_lightning.skill import SkillModule
 
 Discount = Literal["per_skill", "per_step"]

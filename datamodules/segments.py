@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import lightning.pytorch as pl
@@ -13,121 +13,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from datamodules.collect.collectors import can_collect
+from datamodules.loader import Batch, TensorLoader
 from datamodules.sources import load_trajectories, resolve_task
 from datamodules.trajectories import Trajectories, Windows
 from dds_lightning.errors import UserError
 from dds_lightning.nn.normaliser import MIN_STD
 from dds_lightning.tasks import get_task
 
-Batch = dict[str, Tensor]
-
 STD_FLOOR = MIN_STD
 """Standard deviations are at least this, so that an observation that never changes does not divide by
 zero."""
-
-
-class TensorLoader:
-    """Batches by index, in an order that is a function of (seed, epoch).
-
-    Shuffled batches are an endless stream of epochs, each a new permutation; an iteration hands out the next
-    `len(self)` of them, so one that was left early is taken up where it stopped. Without shuffling every
-    iteration begins at the first item. `state_dict` and `load_state_dict` hold the place in the stream, to
-    the batch; Lightning saves and restores them by itself. There are no workers: indexing is cheaper than a
-    message.
-    """
-
-    def __init__(
-        self,
-        gather: Callable[[Tensor], Batch],
-        size: int,
-        batch_size: int,
-        shuffle: bool = False,
-        seed: int = 0,
-        *,
-        drop_last: bool = False,
-        rank: int = 0,
-        world_size: int = 1,
-        device: torch.device | str = "cpu",
-    ) -> None:
-        """Prepare to iterate.
-
-        Args:
-            gather: (B,) int64 indices on `device` -> a batch.
-            size: Number of items; indices run from 0 to size - 1.
-            batch_size: B; no larger than `size`.
-            shuffle: Permute at every epoch; else the order is always 0, 1, 2, ...
-            seed: Of the permutations.
-            drop_last: Leave out a last batch that is not full.
-            rank: Number of this process; it takes every `world_size`-th item.
-            world_size: Number of processes.
-            device: Where the indices go.
-        """
-        if size < world_size:
-            raise UserError(f"data: found {size} items for {world_size} processes, expected at least one each")
-        if batch_size < 1:
-            raise UserError(f"batch_size: found {batch_size}, expected at least 1")
-        self.gather, self.size, self.shuffle, self.seed = gather, size, shuffle, seed
-        self.rank, self.world_size, self.device = rank, world_size, torch.device(device)
-        self._share = size // world_size
-        self.batch_size = min(batch_size, self._share)
-        self.drop_last = drop_last
-        self._epoch, self._batch, self._resuming = 0, 0, False
-
-    def __len__(self) -> int:
-        """Batches of an epoch."""
-        full, rest = divmod(self._share, self.batch_size)
-        return full + (0 if self.drop_last or not rest else 1)
-
-    def order(self, epoch: int) -> Tensor:
-        """(size,) the items in the order of `epoch`, before they are divided among processes."""
-        if not self.shuffle:
-            return torch.arange(self.size)
-        entropy = np.random.SeedSequence([self.seed, epoch]).generate_state(1, np.uint64)[0]
-        generator = torch.Generator().manual_seed(int(entropy >> np.uint64(1)))
-        return torch.randperm(self.size, generator=generator)
-
-    def __iter__(self) -> Iterator[Batch]:
-        """The next `len(self)` batches of the stream; without shuffling, those of one epoch."""
-        # All of this runs at the first `next`: Lightning makes iterators that it never starts. Nothing after
-        # the last `yield` matters: it does not exhaust those that it does start.
-        if not self.shuffle and not self._resuming:
-            self._epoch, self._batch = 0, 0
-        count = len(self) if self.shuffle else len(self) - self._batch
-        self._resuming = False
-        order = self._share_of(self._epoch)
-        for _ in range(count):
-            if self._batch >= len(self):
-                self._epoch, self._batch = self._epoch + 1, 0
-                order = self._share_of(self._epoch)
-            start = self._batch * self.batch_size
-            self._batch += 1
-            yield self.gather(order[start : start + self.batch_size])
-
-    def _share_of(self, epoch: int) -> Tensor:
-        return self.order(epoch)[self.rank :: self.world_size][: self._share].to(self.device)
-
-    def state_dict(self) -> dict[str, int]:
-        """Epoch, batches handed out, and what the order depends on."""
-        return {"epoch": self._epoch, "batch": self._batch, **self._identity()}
-
-    def load_state_dict(self, state: dict[str, int]) -> None:
-        """Go on where `state` was taken.
-
-        Raises:
-            UserError: When the loader would hand out other batches than the one whose state this is.
-        """
-        for key, own in self._identity().items():
-            if state.get(key) != own:
-                raise UserError(
-                    f"data: the checkpoint was made with {key} = {state.get(key)}, now it is {own}; resume "
-                    "with the same data and batch size"
-                )
-        self._epoch, self._batch, self._resuming = state["epoch"], state["batch"], True
-
-    def _identity(self) -> dict[str, int]:
-        return {
-            "size": self.size, "batch_size": self.batch_size, "seed": self.seed, "shuffle": int(self.shuffle)
-        }  # fmt: skip
 
 
 class SegmentDataModule(pl.LightningDataModule):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from datamodules.validation import DataError
 from dds_lightning.errors import UserError
-from dds_lightning.files import folder_written_whole, mend_folder, refuse_newer
+from dds_lightning.saving.files import folder_written_whole, mend_folder, refuse_newer
 
 FORMAT = 1
 
@@ -23,7 +23,7 @@ def save_arrays(
 ) -> Path:
     """Write `directory` with one .npy file an array and `trajectories.json`, which holds `facts` and the format.
 
-    The folder is whole or absent (`dds_lightning.files.folder_written_whole`).
+    The folder is whole or absent (`dds_lightning.saving.files.folder_written_whole`).
 
     Raises:
         UserError: When the folder exists and `overwrite` is False.

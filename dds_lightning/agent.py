@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
 from dds_lightning.errors import UserError
-from dds_lightning.files import short
+from dds_lightning.saving.files import short
 
 if TYPE_CHECKING:
     from dds_lightning.policy import PolicyModule
@@ -292,7 +292,7 @@ class DDSAgent(nn.Module):
         Raises:
             UserError: the directory holds something that was not published.
         """
-        from dds_lightning.checkpointing import publish
+        from dds_lightning.saving.published import publish
 
         modules: dict[str, nn.Module] = {"skill": self.skill}
         if self.policy is not None:
@@ -313,9 +313,9 @@ class DDSAgent(nn.Module):
         Raises:
             UserError: files are missing, changed, of a newer version, or do not fit; the message names them.
         """
-        from dds_lightning.checkpointing import load_published
-        from dds_lightning.hub import is_hub, pull
         from dds_lightning.policy import PolicyModule
+        from dds_lightning.saving.hub import is_hub, pull
+        from dds_lightning.saving.published import load_published
         from dds_lightning.skill import SkillModule
 
         directory = pull(str(directory)) if is_hub(directory) else directory

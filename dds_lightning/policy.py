@@ -27,12 +27,11 @@ from typing import Any, ClassVar, Literal, get_args
 import torch
 from torch import Tensor, nn
 
-from dds_lightning import losses
+import dds_lightning.losses as losses
 from dds_lightning.errors import UserError
-from dds_lightning.finetune import StageModule
+from dds_lightning.module import StageModule, is_log_step
 from dds_lightning.nn.mlp import MLP, FourierFeatures
 from dds_lightning.nn.normaliser import Normaliser
-from dds_lightning.optim import is_log_step
 
 Selection = Literal["sample", "greedy", "argmax_q"]
 Solution = Literal["regression", "closed_form"]

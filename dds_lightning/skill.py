@@ -15,14 +15,14 @@ from torch import Tensor
 from torchmetrics import MeanMetric
 
 from dds_lightning.errors import UserError
-from dds_lightning.finetune import StageModule, refuse_other_box
-from dds_lightning.metrics import CodebookUsage
+from dds_lightning.finetune import refuse_other_box
+from dds_lightning.module import StageModule, is_log_step
 from dds_lightning.nn.codebook import Codebook, CodebookInit, Quantised
 from dds_lightning.nn.diffusion import DiffusionDecoder, MLPDecoder, Sampler
 from dds_lightning.nn.encoder import ENCODERS
 from dds_lightning.nn.gaussian import GaussianBottleneck, GaussianSkill
 from dds_lightning.nn.normaliser import ActionBox, Normaliser
-from dds_lightning.optim import is_log_step
+from dds_lightning.nn.usage import CodebookUsage
 
 START_BATCHES = 64
 """Batches whose encodings start the codebook by k-means."""

@@ -30,8 +30,8 @@ import pandas as pd
 from IPython.display import Image
 
 from dds_lightning import DDSAgent, get_task
-from dds_lightning.interpret.clip import write_clip
-from dds_lightning.interpret.maze import choose_episodes, plot_trajectories
+from dds_lightning.interpret.draw.clip import write_clip
+from dds_lightning.interpret.draw.maze import choose_episodes, plot_trajectories
 from dds_lightning.rollout import Contestant, rollout
 
 # %% tags=["parameters"] quick={"EPISODES": 2}

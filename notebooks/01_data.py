@@ -34,11 +34,11 @@ from matplotlib.figure import Figure
 from datamodules import DataError, Trajectories, check_dataset, collect_pointmaze, describe, load_trajectories
 from datamodules.collect.antmaze import collect_antmaze
 from dds_lightning import get_task
-from dds_lightning.interpret.body import body_frames
-from dds_lightning.interpret.drawing import draw_starts, draw_trail, draw_walls
-from dds_lightning.interpret.gif import Still, gif_bytes
-from dds_lightning.interpret.palette import WALL
-from dds_lightning.interpret.replay import body_states, simulator
+from dds_lightning.interpret.draw.drawing import draw_starts, draw_trail, draw_walls
+from dds_lightning.interpret.draw.gif import Still, gif_bytes
+from dds_lightning.interpret.draw.palette import WALL
+from dds_lightning.interpret.measure.body import body_frames
+from dds_lightning.interpret.measure.replay import body_states, simulator
 from dds_lightning.tasks import task_table
 
 # %% tags=["parameters"] quick={"STEPS": 3000, "ANT_STEPS": 30}

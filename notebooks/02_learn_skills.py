@@ -35,12 +35,12 @@ from matplotlib.figure import Figure
 from datamodules import SegmentDataModule, collect_pointmaze, load_trajectories
 from datamodules.relabel import relabel
 from dds_lightning import DDSAgent, SkillModule, get_task
-from dds_lightning.interpret.clip import replay_clip
-from dds_lightning.interpret.drawing import draw_number
-from dds_lightning.interpret.maze import plot_skills_by_start, plot_starts_by_skill
-from dds_lightning.interpret.palette import skill_colour
+from dds_lightning.interpret.draw.clip import replay_clip
+from dds_lightning.interpret.draw.drawing import draw_number
+from dds_lightning.interpret.draw.maze import plot_skills_by_start, plot_starts_by_skill
+from dds_lightning.interpret.draw.palette import skill_colour
 from dds_lightning.nn.codebook import Codebook
-from dds_lightning.study.replays import replay_skills
+from dds_lightning.study.skill_replays import replay_skills
 
 logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
 warnings.filterwarnings("ignore", message=".*(does not have many workers|LeafSpec|logging interval|GPU).*")

@@ -38,11 +38,11 @@ from matplotlib.figure import Figure
 from datamodules import Trajectories, collect_pointmaze, load_trajectories
 from datamodules.relabel import relabel
 from dds_lightning import DDSAgent, get_task
-from dds_lightning.interpret.charts import plot_transitions
-from dds_lightning.interpret.drawing import draw_number, draw_starts, draw_walls, extent, zoom
-from dds_lightning.interpret.gif import Still, gif_bytes
-from dds_lightning.interpret.palette import NO_SKILL, skill_colour
-from dds_lightning.interpret.statistics import code_segments, transition_matrix
+from dds_lightning.interpret.draw.charts import plot_transitions
+from dds_lightning.interpret.draw.drawing import draw_number, draw_starts, draw_walls, extent, zoom
+from dds_lightning.interpret.draw.gif import Still, gif_bytes
+from dds_lightning.interpret.draw.palette import NO_SKILL, skill_colour
+from dds_lightning.interpret.measure.statistics import code_segments, transition_matrix
 
 warnings.filterwarnings("ignore", message=".*are shorter than horizon.*")  # an episode or two of a few steps
 

@@ -35,13 +35,13 @@ from matplotlib.figure import Figure
 from datamodules import RelabeledDataModule, collect_pointmaze, load_trajectories
 from datamodules.relabel import relabel, relabel_key
 from dds_lightning import DDSAgent, PolicyModule, get_task, losses
-from dds_lightning.interpret.clip import write_clip
-from dds_lightning.interpret.drawing import draw_walls
-from dds_lightning.interpret.maze import plot_failures, plot_value_map
-from dds_lightning.interpret.palette import skill_colour
-from dds_lightning.interpret.values import plot_policy_map
+from dds_lightning.interpret.draw.clip import write_clip
+from dds_lightning.interpret.draw.drawing import draw_walls
+from dds_lightning.interpret.draw.maze import plot_failures, plot_value_map
+from dds_lightning.interpret.draw.palette import skill_colour
+from dds_lightning.interpret.draw.values import plot_policy_map
 from dds_lightning.rollout import Contestant, rollout
-from dds_lightning.study.replays import replay_skills
+from dds_lightning.study.skill_replays import replay_skills
 
 logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
 warnings.filterwarnings("ignore", message=".*(does not have many workers|LeafSpec|logging interval|GPU).*")

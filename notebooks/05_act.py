@@ -39,15 +39,15 @@ from PIL import ImageDraw
 
 from dds_lightning import DDSAgent, get_task
 from dds_lightning.cli import main
-from dds_lightning.interpret.body import body_frames
-from dds_lightning.interpret.drawing import draw_walls
-from dds_lightning.interpret.gif import Still, gif_bytes
-from dds_lightning.interpret.maze import choose_episodes, plot_failures, plot_trajectories
-from dds_lightning.interpret.palette import skill_colour
-from dds_lightning.interpret.rendering import render_frames
-from dds_lightning.interpret.replay import body_states, simulator
-from dds_lightning.interpret.stitching import draw_timeline
-from dds_lightning.interpret.strobe import body_clip, plot_strobes
+from dds_lightning.interpret.draw.drawing import draw_walls
+from dds_lightning.interpret.draw.gif import Still, gif_bytes
+from dds_lightning.interpret.draw.maze import choose_episodes, plot_failures, plot_trajectories
+from dds_lightning.interpret.draw.palette import skill_colour
+from dds_lightning.interpret.draw.rendering import render_frames
+from dds_lightning.interpret.draw.stitching import draw_timeline
+from dds_lightning.interpret.draw.strobe import body_clip, plot_strobes
+from dds_lightning.interpret.measure.body import body_frames
+from dds_lightning.interpret.measure.replay import body_states, simulator
 from dds_lightning.rollout import Contestant, RolloutResult, rollout
 from dds_lightning.study.tables import readable, summary_table, wilson
 

@@ -41,11 +41,11 @@ from datamodules import RelabeledDataModule, SegmentDataModule, Trajectories, co
 from dds_lightning import DDSAgent, PolicyModule, SkillModule, get_task
 from dds_lightning.callbacks.resume import undisturbed
 from dds_lightning.errors import UserError
-from dds_lightning.interpret.clip import write_clip
-from dds_lightning.interpret.drawing import draw_number, draw_walls
-from dds_lightning.interpret.maze import choose_episodes, plot_skills_by_start
+from dds_lightning.interpret.draw.clip import write_clip
+from dds_lightning.interpret.draw.drawing import draw_number, draw_walls
+from dds_lightning.interpret.draw.maze import choose_episodes, plot_skills_by_start
 from dds_lightning.rollout import Contestant, rollout
-from dds_lightning.study.replays import replay_skills
+from dds_lightning.study.skill_replays import replay_skills
 
 logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
 warnings.filterwarnings(

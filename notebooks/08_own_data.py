@@ -41,14 +41,14 @@ from matplotlib.figure import Figure
 
 from datamodules import DataError, RelabeledDataModule, SegmentDataModule, Trajectories, describe, load_trajectories
 from dds_lightning import DDSAgent, PolicyModule, SkillModule, get_task
+from dds_lightning.baselines.behaviour_cloning import BehaviourCloning, CloneActor
 from dds_lightning.cli import main
-from dds_lightning.interpret.clip import write_clip
-from dds_lightning.interpret.dataset import plot_dataset
-from dds_lightning.interpret.drawing import draw_number, draw_starts, draw_trail, draw_walls
-from dds_lightning.interpret.maze import choose_episodes, plot_trajectories, plot_value_map
-from dds_lightning.interpret.palette import skill_colour
+from dds_lightning.interpret.draw.clip import write_clip
+from dds_lightning.interpret.draw.dataset import plot_dataset
+from dds_lightning.interpret.draw.drawing import draw_number, draw_starts, draw_trail, draw_walls
+from dds_lightning.interpret.draw.maze import choose_episodes, plot_trajectories, plot_value_map
+from dds_lightning.interpret.draw.palette import skill_colour
 from dds_lightning.rollout import Contestant, rollout
-from dds_lightning.study.baselines import BehaviourCloning, CloneActor
 from dds_lightning.study.tables import readable, summary_table
 from dds_lightning.tasks import Task
 

@@ -41,12 +41,12 @@ from matplotlib.figure import Figure
 from datamodules import describe, load_trajectories
 from dds_lightning import DDSAgent, SkillModule, get_task
 from dds_lightning.configs import find
-from dds_lightning.interpret.body import body_frames
-from dds_lightning.interpret.dataset import plot_dataset
-from dds_lightning.interpret.palette import skill_colour
-from dds_lightning.interpret.replay import body_states, simulator
-from dds_lightning.interpret.statistics import code_segments
-from dds_lightning.interpret.strobe import body_clip, plot_strobes
+from dds_lightning.interpret.draw.dataset import plot_dataset
+from dds_lightning.interpret.draw.palette import skill_colour
+from dds_lightning.interpret.draw.strobe import body_clip, plot_strobes
+from dds_lightning.interpret.measure.body import body_frames
+from dds_lightning.interpret.measure.replay import body_states, simulator
+from dds_lightning.interpret.measure.statistics import code_segments
 from dds_lightning.rollout import Contestant, rollout
 
 # %% tags=["parameters"] quick={"DATA_STEPS": 4000, "SKILL_STEPS": 4, "POLICY_STEPS": 4, "CLONE_STEPS": 4, "PLAYED": 1}

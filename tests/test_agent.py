@@ -9,11 +9,11 @@ import pytest
 import torch
 from torch import nn
 
-from dds_lightning.actors import AgentGroup
 from dds_lightning.agent import DDSAgent
 from dds_lightning.errors import UserError
 from dds_lightning.policy import PolicyModule
-from dds_lightning.rollout import Contestant, rollout, single_skills
+from dds_lightning.rollout.actors import AgentGroup, Contestant, single_skills
+from dds_lightning.rollout.play import rollout
 from dds_lightning.skill import SkillModule
 from dds_lightning.tasks import get_task
 

@@ -15,9 +15,9 @@ from dds_lightning.configs import (
     run_defaults,
 )
 from dds_lightning.errors import UserError
-from dds_lightning.run_settings import RunSettings
+from dds_lightning.pipeline.settings import RunSettings
 from dds_lightning.tasks import get_task, task_names
-from dds_lightning.training.fitting import settings_of
+from dds_lightning.training.stage_cli import settings_of
 
 
 def _flat(value, prefix=""):

@@ -7,8 +7,9 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from dds_lightning.checkpointing import AtomicCheckpointIO, publish
 from dds_lightning.errors import UserError
+from dds_lightning.saving.checkpoint import AtomicCheckpointIO
+from dds_lightning.saving.published import publish
 from dds_lightning.skill import SkillModule
 
 SMALL = {

@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from dds_lightning.checkpointing import AtomicCheckpointIO
 from dds_lightning.errors import UserError
 from dds_lightning.policy import PolicyModule
+from dds_lightning.saving.checkpoint import AtomicCheckpointIO
 
 
 class Transitions(pl.LightningDataModule):

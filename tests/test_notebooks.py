@@ -11,7 +11,7 @@ import pytest
 
 from dds_lightning.cli.parser import build_parser, prepare
 from dds_lightning.tasks import task_names
-from dds_lightning.training.fitting import settings_of
+from dds_lightning.training.stage_cli import settings_of
 from notebooks.execute import cells_of_script, metadata_of, run_quick
 
 HERE = Path(__file__).parents[1] / "notebooks"

@@ -9,9 +9,9 @@ import pytest
 from datamodules import Trajectories, describe, load_trajectories
 from datamodules.validation import DataError
 from dds_lightning import DDSAgent, get_task
-from dds_lightning.actors import RandomActor
-from dds_lightning.interpret.maze import plot_trajectories
-from dds_lightning.rollout import Contestant, rollout
+from dds_lightning.interpret.draw.maze import plot_trajectories
+from dds_lightning.rollout.actors import Contestant, RandomActor
+from dds_lightning.rollout.play import rollout
 from dds_lightning.tasks import Task
 from tests.fits import POLICY, QUIET, call, skill_of
 

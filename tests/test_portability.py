@@ -11,12 +11,12 @@ from rich.console import Console
 
 from datamodules.relabel import Relabelled
 from datamodules.trajectories import Trajectories
-from dds_lightning import __version__
+from dds_lightning._version import __version__
 from dds_lightning.callbacks.resume import rng_state, set_rng_state
-from dds_lightning.checkpointing import FORMAT_KEY, AtomicCheckpointIO, load_ckpt
 from dds_lightning.errors import UserError
 from dds_lightning.policy import PolicyModule
-from dds_lightning.stages import Stages
+from dds_lightning.saving.checkpoint import FORMAT_KEY, AtomicCheckpointIO, load_ckpt
+from dds_lightning.saving.run_directory import Stages
 from dds_lightning.study.findings import read_marker
 
 NEWER = rf"has format 2, but this version of dds-lightning \({__version__}\) reads up to 1: install a newer one"

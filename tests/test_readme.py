@@ -11,7 +11,7 @@ import pytest
 from datamodules import load_trajectories
 from dds_lightning.cli import main
 from dds_lightning.cli.parser import build_parser, prepare
-from dds_lightning.training.fitting import settings_of
+from dds_lightning.training.stage_cli import settings_of
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()

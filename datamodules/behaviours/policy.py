@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from datamodules.validation import DataError
-from dds_lightning.files import written_whole
+from dds_lightning.saving.files import written_whole
 
 FORMAT = "1"
 OBSERVATION_CLIP = 10.0

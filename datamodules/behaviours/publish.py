@@ -14,11 +14,17 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from datamodules.behaviours.evaluation import RunnerScore, WalkScore, score_navigator, score_runner, score_walker
 from datamodules.behaviours.policy import MLPPolicy
-from datamodules.behaviours.recipes import RECIPES, Recipe, get_recipe
+from datamodules.behaviours.training.evaluation import (
+    RunnerScore,
+    WalkScore,
+    score_navigator,
+    score_runner,
+    score_walker,
+)
+from datamodules.behaviours.training.recipes import RECIPES, Recipe, get_recipe
 from dds_lightning.errors import UserError
-from dds_lightning.files import sha256, written_whole
+from dds_lightning.saving.files import sha256, written_whole
 from dds_lightning.tasks import get_task
 
 NOISES = (0.0, 0.1, 0.2)

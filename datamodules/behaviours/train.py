@@ -27,12 +27,12 @@ except ImportError as missing:
         "training a behaviour needs stable-baselines3: pip install 'dds-lightning[behaviours]'"
     ) from missing
 
-from datamodules.behaviours.ant_world import AntWorld
-from datamodules.behaviours.fast_ppo import FastPPO
-from datamodules.behaviours.learner import build_learner, export_policy, load_state, save_state
-from datamodules.behaviours.recipes import RECIPES, Recipe, get_recipe
-from datamodules.behaviours.worlds import World
-from dds_lightning.training.interrupts import caught, deferred, pending
+from datamodules.behaviours.training.ant_world import AntWorld
+from datamodules.behaviours.training.fast_ppo import FastPPO
+from datamodules.behaviours.training.learner import build_learner, export_policy, load_state, save_state
+from datamodules.behaviours.training.recipes import RECIPES, Recipe, get_recipe
+from datamodules.behaviours.training.worlds import World
+from dds_lightning.console.interrupts import caught, deferred, pending
 
 COLUMNS = ("steps", "hours", "return", "episode_steps", "speed", "falls_per_1000", "exploration", "steps_per_second")
 EULER = int(mujoco.mjtIntegrator.mjINT_EULER)

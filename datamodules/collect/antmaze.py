@@ -17,7 +17,7 @@ from datamodules.collect.recording import Episode
 from datamodules.collect.waypoints import Waypoints
 from dds_lightning.envs.build import build_env
 from dds_lightning.errors import UserError
-from dds_lightning.files import sha256
+from dds_lightning.saving.files import sha256
 from dds_lightning.tasks import Cell, Task, get_task
 
 BODIES = 16

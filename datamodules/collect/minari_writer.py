@@ -18,7 +18,7 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from datamodules.storage import refuse_existing
-from dds_lightning.files import folder_written_whole
+from dds_lightning.saving.files import folder_written_whole
 
 Episode = Mapping[str, Any]
 """Minari's field names (observations, actions, rewards, ..., infos) to arrays or mappings of arrays."""

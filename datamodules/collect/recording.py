@@ -27,7 +27,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from dds_lightning.errors import UserError
-from dds_lightning.files import written_whole
+from dds_lightning.saving.files import written_whole
 
 Episode = dict[str, Any]
 

@@ -50,10 +50,10 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.sources.belonging import refuse_other_task
 from datamodules.sources.fetch import find_d4rl
 from datamodules.sources.goal import cut_at_goal, ends_of
 from datamodules.sources.hdf5 import check_array, member, open_hdf5, read_array, read_rows, row_slices
+from datamodules.sources.plausibility import refuse_other_task
 from datamodules.trajectories import Trajectories
 from datamodules.validation import DataError, finite, in_box
 from datamodules.windows import ranges

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, NoReturn
 
 from dds_lightning.errors import UserError
-from dds_lightning.files import sync
+from dds_lightning.saving.files import sync
 
 ATTEMPTS = 5
 """Tries in a row; each goes on where the one before was cut."""

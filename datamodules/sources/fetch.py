@@ -11,7 +11,7 @@ from urllib.parse import quote
 from datamodules.sources.download import download
 from datamodules.validation import DataError
 from dds_lightning.errors import UserError
-from dds_lightning.files import neighbours
+from dds_lightning.saving.files import neighbours
 from dds_lightning.tasks import Task, get_task, task_names
 
 D4RL_SERVER = "http://rail.eecs.berkeley.edu/datasets/offline_rl"

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.validation import DataError
-from dds_lightning.files import neighbours
+from dds_lightning.saving.files import neighbours
 
 FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32", 5: "n-bit", 6: "scale-offset", 32000: "lzf"}
 """Filters that need no plug-in."""

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from datamodules.sources.observations import Layout, box_shape, find_layout, space_in_words, task_layout
 from datamodules.validation import DataError
 from dds_lightning.envs.kitchen import SUBTASKS
-from dds_lightning.files import neighbours
+from dds_lightning.saving.files import neighbours
 from dds_lightning.tasks import Task, known_env_ids
 
 MAX_BYTES = 2**20

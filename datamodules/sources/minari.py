@@ -23,7 +23,7 @@ from datamodules.sources.observations import Layout, Part
 from datamodules.trajectories import Trajectories
 from datamodules.validation import FIELDS, DataError, validate_episode
 from dds_lightning.errors import UserError
-from dds_lightning.files import mend_folder
+from dds_lightning.saving.files import mend_folder
 from dds_lightning.tasks import Task
 
 Fields = dict[str, NDArray[Any]]

@@ -13,10 +13,10 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout
 from typing import Any
 
-from dds_lightning import __version__
+from dds_lightning._version import __version__
+from dds_lightning.console.interrupts import Interrupted, caught
 from dds_lightning.errors import UserError, is_out_of_memory, reason
-from dds_lightning.files import DISK_ERRORS
-from dds_lightning.training.interrupts import Interrupted, caught
+from dds_lightning.saving.files import DISK_ERRORS
 
 USAGE_ERROR = 2
 GOES_ON = ("run", "relabel", "data collect", "data fetch")
@@ -65,7 +65,7 @@ def _dispatch(words: list[str]) -> int:
         return 0
     try:
         if words and words[0] in STAGES:
-            from dds_lightning.training.fitting import command
+            from dds_lightning.training.stage_cli import command
 
             as_json, work = "--json" in words, command(words[0], words[1:])
         else:
@@ -111,7 +111,7 @@ def _command(words: list[str]) -> tuple[bool, Callable[[], Any]]:
 
 def _report(work: Callable[[], Any], as_json: bool) -> int:
     """Do the work with standard output turned away, then print what it returned."""
-    from dds_lightning.reports import Report
+    from dds_lightning.console.reports import Report
 
     with redirect_stdout(sys.stderr):
         report = work()

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from dds_lightning.cli.arguments import data_spec
+from dds_lightning.console.reports import Report, pairs, table
 from dds_lightning.errors import UserError
-from dds_lightning.reports import Report, pairs, table
 
 STAGES = 11
 """What the progress bar counts when nothing is compared; about so many things are done."""
@@ -46,7 +46,7 @@ def atlas(
         seed: of everything random
         figures: a folder in which each picture is also written as a small PNG file, named after the page
     """
-    from dds_lightning.hub import is_hub, pull
+    from dds_lightning.saving.hub import is_hub, pull
 
     page = Path(out)
     if page.suffix != ".html" or page.is_dir():
@@ -60,7 +60,7 @@ def atlas(
         raise UserError(f"there is no {place}: give a run of `dds run`, a published directory or a skill checkpoint")
     spec = data_spec(data) if data else None
 
-    from dds_lightning.study.atlas import atlas as make
+    from dds_lightning.study.subject import atlas as make
 
     with _progress(STAGES + len(against)) as tell:
         others, folder = [Path(one) for one in against], Path(figures) if figures else None

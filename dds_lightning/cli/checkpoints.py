@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
+from dds_lightning.console.reports import Report, pairs, table
 from dds_lightning.errors import UserError
-from dds_lightning.reports import Report, pairs, table
 
 
 def publish(
@@ -33,12 +33,12 @@ def publish(
         public: let everybody see a new repository on the hub
     """
     from dds_lightning.agent import DDSAgent
-    from dds_lightning.hub import is_hub, push
-    from dds_lightning.publishing import CARD, load_published
+    from dds_lightning.saving.hub import is_hub, push
+    from dds_lightning.saving.published import CARD, load_published
+    from dds_lightning.sharing.verify import verify_published
     from dds_lightning.study.card import with_diagnosis
     from dds_lightning.study.contestants import agent_directory
     from dds_lightning.tasks import get_task
-    from dds_lightning.verification import verify_published
 
     if (run == "-") != (skill is not None):
         raise UserError(f"run is '{run}' and --skill is {skill}: give a run, or - and --skill CHECKPOINT")
@@ -80,7 +80,7 @@ def list_(root: list[str] = ["checkpoints", "runs"]) -> Report:  # noqa: B006 - 
     Args:
         root: folders to look in
     """
-    from dds_lightning.verification import find_published
+    from dds_lightning.sharing.verify import find_published
 
     found = find_published(root)
     if found.empty:
@@ -96,8 +96,8 @@ def verify(directory: str) -> Report:
     Args:
         directory: as published, or hf:OWNER/NAME
     """
-    from dds_lightning.hub import is_hub, pull
-    from dds_lightning.verification import verify_published
+    from dds_lightning.saving.hub import is_hub, pull
+    from dds_lightning.sharing.verify import verify_published
 
     facts = verify_published(pull(directory) if is_hub(directory) else directory)
     return Report(facts, [f"{directory} is sound: {_words(facts)}"])
@@ -126,9 +126,9 @@ def export(
         noise_scale: of the decoder; without it the agent's
     """
     from dds_lightning.agent import DDSAgent
-    from dds_lightning.export import SUFFIXES, check_exported, describe, export_agent
-    from dds_lightning.hub import is_hub, pull
-    from dds_lightning.publishing import load_published
+    from dds_lightning.saving.hub import is_hub, pull
+    from dds_lightning.saving.published import load_published
+    from dds_lightning.sharing.export import SUFFIXES, check_exported, describe, export_agent
     from dds_lightning.study.contestants import agent_directory
 
     source = pull(directory) if is_hub(directory) else agent_directory(Path(directory))

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from dds_lightning.cli.arguments import data_spec
+from dds_lightning.console.reports import Report, pairs, table
 from dds_lightning.errors import UserError
-from dds_lightning.reports import Report, pairs, table
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -73,7 +73,7 @@ def run(
         skill: settings for `dds skill fit`, see above
         policy: settings for `dds policy fit`, see above
     """
-    from dds_lightning.run import RunSettings, run_all
+    from dds_lightning.pipeline.run import RunSettings, run_all
 
     return run_all(
         RunSettings.with_preset(
@@ -124,7 +124,7 @@ def relabel(
         reward_shift: shift of the learning reward; without it the task's
     """
     from datamodules.relabel import Relabelled
-    from datamodules.relabeled import RelabeledDataModule
+    from datamodules.relabelled import RelabeledDataModule
 
     module = RelabeledDataModule(
         task,
@@ -185,7 +185,7 @@ def evaluate(
         workers: processes for environments; without it one for every core
         out: Parquet file for the table of episodes
     """
-    from dds_lightning.study.evaluation import evaluate as play
+    from dds_lightning.study.evaluate import evaluate as play
 
     return play(
         Path(directory),
@@ -241,7 +241,7 @@ def data_check(data: str, task: str | None = None, horizon: int | None = None, r
         )
     if task is None:
         raise UserError("--replay needs an environment: give --task NAME; `dds tasks` lists them")
-    from datamodules.replay import replay_check
+    from datamodules.physics.check import replay_check
 
     found = replay_check(spec, task, replay)
     # What does not fit the task may well be sound; loading it for the task would refuse other coordinates first.

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from dds_lightning.cli.arguments import data_spec
+from dds_lightning.console.reports import Report, pairs, table
 from dds_lightning.errors import UserError
-from dds_lightning.reports import Report, pairs, table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -57,9 +57,8 @@ def show(
         out: file of the figure (.png, .pdf or .svg); without it show/NAME.png in the current folder
         no_figure: print the tables only
     """
-    from datamodules import load_trajectories
     from datamodules.inspection import describe, episode_table
-    from datamodules.sources import resolve_task
+    from datamodules.sources import load_trajectories, resolve_task
 
     spec = data_spec(data)
     if episodes < 0:
@@ -168,8 +167,8 @@ def _advice(trajectories: Trajectories) -> str:
 
 
 def _draw(trajectories: Trajectories, task: Task | None, path: Path) -> None:
-    from dds_lightning.files import written_whole
-    from dds_lightning.interpret.dataset import plot_dataset
+    from dds_lightning.interpret.draw.dataset import plot_dataset
+    from dds_lightning.saving.files import written_whole
 
     figure = plot_dataset(trajectories, task)
     path.parent.mkdir(parents=True, exist_ok=True)

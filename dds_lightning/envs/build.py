@@ -12,29 +12,29 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
+from dds_lightning.envs.mazes import D4RL_ANTMAZES, d4rl_antmaze_id
+
 _BUILD_LOCK = threading.Lock()
 
 
 def register_environments() -> None:
     """Make gymnasium-robotics' environments and ours known to Gymnasium; slow the first time, so done late."""
-    from dds_lightning.tasks.rows import ROWS  # what an environment is, its row says
-
     with _BUILD_LOCK, contextlib.redirect_stderr(io.StringIO()):  # it prints a notice on others
         import gymnasium_robotics
 
         gym.register_envs(gymnasium_robotics)
-        for task in ROWS:
-            if task.env_id.startswith("dds/AntMazeD4RL_") and task.env_id not in gym.registry:
+        for size, maze in D4RL_ANTMAZES.items():
+            if d4rl_antmaze_id(size) not in gym.registry:
                 gym.register(
-                    task.env_id,
+                    d4rl_antmaze_id(size),
                     entry_point="dds_lightning.envs.antmaze:D4RLAntMazeEnv",
-                    max_episode_steps=task.max_episode_steps,
+                    max_episode_steps=maze.cap,
                     kwargs={
-                        "maze_map": task.maze_map,
-                        "start_cell": task.start_cell,
-                        "goal_cell": task.goal_cell,
-                        "cell_size": task.cell_size,
-                        "goal_radius": task.goal_radius,
+                        "maze_map": maze.maze_map,
+                        "start_cell": maze.start_cell,
+                        "goal_cell": maze.goal_cell,
+                        "cell_size": maze.cell_size,
+                        "goal_radius": maze.goal_radius,
                     },
                 )
 

@@ -5,7 +5,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from dds_lightning import losses
+import dds_lightning.losses as losses
 
 CodebookInit = Literal["kmeans", "uniform", "normal"]
 

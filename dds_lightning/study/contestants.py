@@ -4,9 +4,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dds_lightning.actors import EveryRow
 from dds_lightning.errors import UserError
-from dds_lightning.rollout import Contestant, single_skills
+from dds_lightning.rollout.actors import Contestant, EveryRow, single_skills
 from dds_lightning.tasks import Task
 
 if TYPE_CHECKING:

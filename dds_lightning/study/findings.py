@@ -10,8 +10,8 @@ from typing import Any
 import pandas as pd
 
 from dds_lightning.errors import UserError
-from dds_lightning.results import RolloutResult
-from dds_lightning.stages import read_marker
+from dds_lightning.rollout.result import RolloutResult
+from dds_lightning.saving.run_directory import read_marker
 from dds_lightning.study.tables import failures_table, skills_table, summary_table
 from dds_lightning.tasks import Task, get_task
 

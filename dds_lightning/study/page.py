@@ -153,7 +153,7 @@ def _failures(found: Findings, files: Mapping[str, str]) -> str:
 
 
 def _run(found: Findings) -> str:
-    from dds_lightning.stages import duration
+    from dds_lightning.saving.run_directory import duration
 
     seconds = [(stage, float(marker.get("seconds", 0.0))) for stage, marker in found.markers.items()]
     if not seconds:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dds_lightning.seating import episode_seed
+from dds_lightning.rollout.schedule import episode_seed
 from dds_lightning.tasks import Task
 from dds_lightning.tasks.facts import PAPERS_DATA
 
@@ -97,7 +97,7 @@ def best_facts(last: Path, best: Path) -> dict[str, Any]:
         `monitor` (name of the metric), `value`, `step` and `evaluations`, the number of them that the best was
         chosen from (None where the metric is no rollout's).
     """
-    from dds_lightning.checkpointing import load_ckpt
+    from dds_lightning.saving.checkpoint import load_ckpt
 
     checkpoint = load_ckpt(best)
     kept = next(state for key, state in checkpoint["callbacks"].items() if key.startswith("BestCheckpoint"))

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from dds_lightning.files import written_whole
+from dds_lightning.saving.files import written_whole
 from dds_lightning.study.diagnosis import diagnose
 from dds_lightning.study.findings import Findings
 from dds_lightning.study.protocol import heading, paper_line
@@ -27,7 +27,7 @@ from dds_lightning.tasks import get_task
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from dds_lightning.reports import Report
+    from dds_lightning.console.reports import Report
 
 DPI = 150
 
@@ -50,7 +50,7 @@ def write_report(run_dir: str | Path) -> dict[str, Any]:
     Raises:
         UserError: nothing has been evaluated there, or a file is damaged.
     """
-    from dds_lightning.reports import plain
+    from dds_lightning.console.reports import plain
     from dds_lightning.study.page import page
 
     found = Findings.read(Path(run_dir))
@@ -87,7 +87,7 @@ def report(run_dir: str | Path) -> Report:
     Raises:
         UserError: as `write_report`.
     """
-    from dds_lightning.reports import Report
+    from dds_lightning.console.reports import Report
 
     made = write_report(run_dir)
     paths = [f"{name}: {path}" for name, path in made.items() if isinstance(path, Path)]
@@ -96,7 +96,7 @@ def report(run_dir: str | Path) -> Report:
 
 def told(facts: Mapping[str, Any]) -> list[RenderableType]:
     """The facts of `write_report` for a terminal: the table, and where the main contestant's failures ended."""
-    from dds_lightning.reports import table
+    from dds_lightning.console.reports import table
 
     task, protocol = get_task(facts["task"]), facts.get("protocol")
     summary = readable(pd.DataFrame(facts["table"]), task)
@@ -117,7 +117,7 @@ def told(facts: Mapping[str, Any]) -> list[RenderableType]:
 
 def _draw(found: Findings, folder: Path, logs: Mapping[str, Path]) -> dict[str, Path]:
     """Every figure that the run's files and its task allow."""
-    from dds_lightning.interpret import bars, curves
+    from dds_lightning.interpret.draw import bars, curves
 
     made: dict[str, Path] = {}
 
@@ -137,8 +137,8 @@ def _draw(found: Findings, folder: Path, logs: Mapping[str, Path]) -> dict[str, 
 
 
 def _draw_maze(found: Findings, folder: Path, keep: Any, made: dict[str, Path]) -> None:
-    from dds_lightning.interpret import clip, maze
-    from dds_lightning.study.replays import stored_replays
+    from dds_lightning.interpret.draw import clip, maze
+    from dds_lightning.study.skill_replays import stored_replays
 
     task, result, main = found.task, found.result, found.main
     if result.paths:
@@ -163,7 +163,7 @@ def _value_map(found: Findings, directory: Path) -> Any:
     import numpy as np
 
     from dds_lightning.agent import DDSAgent
-    from dds_lightning.interpret.values import plot_value_map, value_and_codes
+    from dds_lightning.interpret.draw.values import plot_value_map, value_and_codes
 
     policy = DDSAgent.load(directory).policy
     assert policy is not None, "a run's agent has a policy"

@@ -6,21 +6,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from dds_lightning.envs.mazes import D4RL_ANTMAZES, LARGE, MEDIUM, UMAZE, d4rl_antmaze_id
 from dds_lightning.tasks.task import Cell, Task
-
-UMAZE = ("11111", "10001", "11101", "10001", "11111")
-MEDIUM = ("11111111", "10011001", "10010001", "11000111", "10010001", "10100101", "10001001", "11111111")
-LARGE = (
-    "111111111111",
-    "100001000001",
-    "101101010101",
-    "100000010001",
-    "101111011101",
-    "100101000001",
-    "110101010111",
-    "100100010001",
-    "111111111111",
-)  # fmt: skip
 
 _KINDS = ("", "_Diverse_G", "_Diverse_GR")
 """gymnasium-robotics' names of one maze with different goals and starts."""
@@ -87,16 +74,11 @@ def _locomotion() -> tuple[Task, ...]:
 # ---------------------------------------------------------------------- mazes
 
 
-def _antmaze(
-    size: str, *, maze_map: tuple[str, ...], cap: int, goal: Cell, file: str, goals: tuple[Cell, ...], scores: Any
-) -> tuple[Task, ...]:
+def _antmaze(size: str, *, file: str, goals: tuple[Cell, ...], scores: Any) -> tuple[Task, ...]:
     """Both data recipes of one AntMaze, in D4RL's physics and in gymnasium-robotics' (`@robotics`).
 
     Args:
         size: "umaze", "medium" or "large".
-        maze_map: Rows of the maze.
-        cap: Steps of an evaluation episode.
-        goal: The one goal.
         file: The part of D4RL's file names that tells the maze.
         goals: Cells among which D4RL's generation maps draw goals.
         scores: Recipe -> the paper's score.
@@ -104,6 +86,7 @@ def _antmaze(
     Rewards are learnt as 0.1 * (r - 1), IQL's convention for AntMaze at the scale of the other mazes.
     """
     camel = "UMaze" if size == "umaze" else size.capitalize()
+    maze = D4RL_ANTMAZES[camel]
     robotics = tuple(
         f"AntMaze_{camel}{kind}{dense}-v{version}" for version in (4, 5) for kind in _KINDS for dense in ("", "Dense")
     )
@@ -115,20 +98,20 @@ def _antmaze(
         task = Task(
             name=name,
             family="antmaze",
-            env_id=f"dds/AntMazeD4RL_{camel}-v0",
+            env_id=d4rl_antmaze_id(camel),
             observation_dim=29,
             observation_layout="x, y, z, quaternion (w, x, y, z), 8 joint angles, then velocities: 3 linear, "
             "3 angular, 8 joints",
             action_dim=8,
-            max_episode_steps=cap,
+            max_episode_steps=maze.cap,
             step_seconds=0.1,
             physics="d4rl",
-            maze_map=maze_map,
-            cell_size=4.0,
+            maze_map=maze.maze_map,
+            cell_size=maze.cell_size,
             origin="start",
-            start_cell=(1, 1),
-            goal_cell=goal,
-            goal_radius=0.5,
+            start_cell=maze.start_cell,
+            goal_cell=maze.goal_cell,
+            goal_radius=maze.goal_radius,
             goal_noise=0.75,  # the mean of U(0, 1) + U(0, 0.5)
             data_reward="arrival",
             reward_scale=0.1,
@@ -138,8 +121,8 @@ def _antmaze(
                 "d4rl": f"Ant_maze_{file}_noisy_multistart_{start}_multigoal_{many}_sparse_fixed.hdf5",
                 "minari": f"D4RL/antmaze/{name.removeprefix('antmaze-')}-v1",
             },
-            data_start_cells=((1, 1),) if name == "antmaze-umaze" else None,
-            data_goal_cells=(goal,) if name == "antmaze-umaze" else goals if recipe == "play" else None,
+            data_start_cells=(maze.start_cell,) if name == "antmaze-umaze" else None,
+            data_goal_cells=(maze.goal_cell,) if name == "antmaze-umaze" else goals if recipe == "play" else None,
             paper_score=scores[recipe],
         )
         return _with_variants(
@@ -232,27 +215,18 @@ ROWS: tuple[Task, ...] = (
     *_locomotion(),
     *_antmaze(
         "umaze",
-        maze_map=UMAZE,
-        cap=700,
-        goal=(3, 1),
         file="u-maze",
         goals=(),
         scores={"": 95.6, "diverse": 94.5},
     ),
     *_antmaze(
         "medium",
-        maze_map=MEDIUM,
-        cap=1000,
-        goal=(6, 6),
         file="big-maze",
         goals=((2, 6), (5, 1), (6, 5)),
         scores={"play": 88.5, "diverse": 89.1},
     ),
     *_antmaze(
         "large",
-        maze_map=LARGE,
-        cap=1000,
-        goal=(7, 9),
         file="hardest-maze",
         goals=((1, 6), (3, 5), (3, 10), (5, 2), (7, 4), (7, 6), (7, 9)),
         scores={"play": 81.9, "diverse": 82.6},

@@ -219,6 +219,6 @@ class Task:
         Args:
             render_mode: Gymnasium's render mode, for example "rgb_array".
         """
-        from dds_lightning.envs.adapters import make_task_env  # gymnasium is slow to import
+        from dds_lightning.tasks.env import make_task_env  # gymnasium is slow to import
 
         return make_task_env(self, render_mode)

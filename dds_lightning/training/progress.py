@@ -10,7 +10,7 @@ from lightning.pytorch.callbacks import ProgressBar
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from dds_lightning.stages import duration
+from dds_lightning.saving.run_directory import duration
 
 
 class StepProgress(ProgressBar):

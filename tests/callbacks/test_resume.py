@@ -8,9 +8,9 @@ import pytest
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 
-from datamodules.segments import TensorLoader
+from datamodules.loader import TensorLoader
 from dds_lightning.callbacks.resume import ExactResume, rng_state, set_rng_state, undisturbed
-from dds_lightning.checkpointing import AtomicCheckpointIO
+from dds_lightning.saving.checkpoint import AtomicCheckpointIO
 
 BATCHES, STEPS = 13, 31  # two epochs and a bit
 

@@ -213,7 +213,7 @@ def test_heading_is_seen_within_45_degrees_and_speed_in_the_yaw_frame(ant):
 
 def test_worlds_step_as_gymnasium_does():
     pytest.importorskip("stable_baselines3")
-    from datamodules.behaviours.worlds import RUNNERS, RunnerWorld
+    from datamodules.behaviours.training.worlds import RUNNERS, RunnerWorld
     from dds_lightning.envs.build import build_env
 
     for env_id in RUNNERS:
@@ -238,7 +238,7 @@ def test_worlds_step_as_gymnasium_does():
 
 
 def tiny(name):
-    from datamodules.behaviours.recipes import get_recipe
+    from datamodules.behaviours.training.recipes import get_recipe
 
     recipe = get_recipe(name)
     return replace(recipe, environments=2, steps=256, settings={**recipe.settings, "n_steps": 64}, coarse_steps=128)
@@ -247,8 +247,8 @@ def tiny(name):
 @pytest.mark.parametrize("entropy_weight", [0.0, 0.01])
 def test_numpy_gradient_is_autograds(entropy_weight):
     pytest.importorskip("stable_baselines3")
-    from datamodules.behaviours.fast_ppo import Minibatch
-    from datamodules.behaviours.learner import build_learner, export_policy
+    from datamodules.behaviours.training.fast_ppo import Minibatch
+    from datamodules.behaviours.training.learner import build_learner, export_policy
 
     learner = build_learner(tiny("hopper"), seed=0)
     policy, numbers = learner.policy, learner.numbers
@@ -305,7 +305,7 @@ def test_training_leaves_snapshots_and_goes_on(tmp_path, name):
 
 def test_resuming_restores_every_number(tmp_path):
     pytest.importorskip("stable_baselines3")
-    from datamodules.behaviours.learner import build_learner, load_state, save_state
+    from datamodules.behaviours.training.learner import build_learner, load_state, save_state
 
     recipe = tiny("hopper")
     learner = build_learner(recipe, seed=0)
@@ -333,7 +333,7 @@ def test_rungs_spread_over_the_scores():
 
 def test_a_resting_ant_neither_moves_nor_falls():
     pytest.importorskip("stable_baselines3")
-    from datamodules.behaviours.evaluation import score_walker
+    from datamodules.behaviours.training.evaluation import score_walker
 
     score = score_walker(lambda seen: np.zeros((len(seen), 8)), "d4rl", ants=2, steps=60)
     assert abs(score.speed) < 0.2

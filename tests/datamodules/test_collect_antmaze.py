@@ -15,9 +15,9 @@ import pytest
 from datamodules import load_trajectories
 from datamodules.collect import antmaze, recording
 from datamodules.collect.antmaze import AntMazeRecipe, AntNavigator, collect_antmaze
-from dds_lightning.actors import EveryRow
 from dds_lightning.errors import UserError
-from dds_lightning.rollout import Contestant, rollout
+from dds_lightning.rollout.actors import Contestant, EveryRow
+from dds_lightning.rollout.play import rollout
 from dds_lightning.tasks import get_task
 
 TASK = "antmaze-umaze-diverse"

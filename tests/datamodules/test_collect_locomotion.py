@@ -12,7 +12,7 @@ import pytest
 from datamodules import load_trajectories
 from datamodules.behaviours.policy import MLPPolicy
 from datamodules.collect.locomotion import LocomotionRecipe, Runners, collect_locomotion, mixture
-from datamodules.replay import replay_check
+from datamodules.physics.check import replay_check
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import get_task
 

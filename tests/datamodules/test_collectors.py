@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from datamodules.collect.collectors import COLLECTORS, collect, collection_command, refuse_uncollectable
-from datamodules.signature import locate, signature
+from datamodules.sources.stat_hash import locate, signature
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import get_task, task_names
 

@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 
 import datamodules.relabel as relabelling
 from datamodules.relabel import Relabelled, relabel, relabel_key
-from datamodules.relabeled import RelabeledDataModule
+from datamodules.relabelled import RelabeledDataModule
 from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError
 from dds_lightning.skill import SkillModule

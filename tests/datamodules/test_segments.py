@@ -10,7 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from datamodules.segments import STD_FLOOR, SegmentDataModule, TensorLoader
+from datamodules.loader import TensorLoader
+from datamodules.segments import STD_FLOOR, SegmentDataModule
 from datamodules.trajectories import DataError, Trajectories
 from dds_lightning.errors import UserError
 

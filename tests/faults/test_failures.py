@@ -13,11 +13,11 @@ import torch
 from datamodules import collect_pointmaze, load_trajectories
 from datamodules.relabel import Relabelled
 from datamodules.trajectories import Trajectories
-from dds_lightning.checkpointing import AtomicCheckpointIO, load_ckpt, publish
 from dds_lightning.cli import main
 from dds_lightning.errors import UserError, is_out_of_memory
 from dds_lightning.policy import PolicyModule
-from dds_lightning.publishing import load_published
+from dds_lightning.saving.checkpoint import AtomicCheckpointIO, load_ckpt
+from dds_lightning.saving.published import load_published, publish
 from dds_lightning.skill import SkillModule
 from tests.fits import POLICY, QUIET, SKILL, TASK, call, of_data, skill_of, told
 

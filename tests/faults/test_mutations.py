@@ -21,7 +21,7 @@ import yaml
 from dds_lightning.agent import DDSAgent
 from dds_lightning.errors import UserError
 from dds_lightning.policy import PolicyModule
-from dds_lightning.publishing import CONTENTS, SUMS
+from dds_lightning.saving.published import CONTENTS, SUMS
 from dds_lightning.skill import SkillModule
 
 

@@ -84,7 +84,7 @@ def test_the_critics_promise_at_the_start_is_its_mean_over_the_episodes_starts()
     player.policy.value_range.copy_(torch.tensor([-10.0, 0.0]))
     found = start_value(task, player, seed=2, episodes=3)
     env = task.make_env()
-    from dds_lightning.seating import episode_seed
+    from dds_lightning.rollout.schedule import episode_seed
 
     starts = np.stack([env.reset(seed=episode_seed(2, i))[0] for i in range(3)])
     env.close()

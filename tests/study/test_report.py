@@ -13,14 +13,14 @@ import torch
 
 from dds_lightning.agent import DDSAgent
 from dds_lightning.errors import UserError
-from dds_lightning.interpret import clip
+from dds_lightning.interpret.draw import clip
 from dds_lightning.policy import PolicyModule
-from dds_lightning.results import RolloutPath, RolloutResult
+from dds_lightning.rollout.result import RolloutPath, RolloutResult
 from dds_lightning.skill import SkillModule
 from dds_lightning.study import findings
 from dds_lightning.study import report as report_module
-from dds_lightning.study.replays import junctions, replay_skills
 from dds_lightning.study.report import report, told, write_report
+from dds_lightning.study.skill_replays import junctions, replay_skills
 from dds_lightning.tasks import get_task
 
 TASK = get_task("pointmaze-umaze-diverse")

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from dds_lightning.reports import plain
+from dds_lightning.console.reports import plain
 from dds_lightning.study.tables import (
     ends,
     failures_table,

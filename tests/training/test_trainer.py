@@ -11,12 +11,14 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from torch import nn
 
-from dds_lightning.callbacks import ExactResume, FiniteGuard
-from dds_lightning.checkpointing import AtomicCheckpointIO
+from dds_lightning.callbacks import ExactResume, FiniteGuard, rolling
+from dds_lightning.callbacks.best import BestCheckpoint
+from dds_lightning.callbacks.rolling import RollingCheckpoint
 from dds_lightning.errors import UserError
+from dds_lightning.saving.checkpoint import AtomicCheckpointIO
 from dds_lightning.training import trainer as training
 from dds_lightning.training.progress import StepProgress
-from dds_lightning.training.trainer import BestCheckpoint, RollingCheckpoint, trainer_settings
+from dds_lightning.training.trainer import trainer_settings
 
 
 class Line(pl.LightningModule):
@@ -64,7 +66,7 @@ def test_a_checkpoint_is_written_every_so_many_steps_and_seconds(monkeypatch):
     assert saved == [3, 6, 6, 9, 10]  # a validation follows step 6, and what it found belongs into the file
     saved.clear()
     now = iter(range(1000))
-    monkeypatch.setattr(training.time, "monotonic", lambda: next(now))
+    monkeypatch.setattr(rolling.time, "monotonic", lambda: next(now))
     fit([RollingCheckpoint("there", every_n_seconds=4)])
     assert saved[-1] == 10
     assert 2 <= len(saved) <= 5

@@ -1,0 +1,1 @@
+"""How the behaviour policies were trained; needs the extra `behaviours`."""

@@ -1,0 +1,199 @@
+"""Scores of behaviour policies: returns of runners, speeds and falls of the Ant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from datamodules.behaviours.policy import MLPPolicy
+from dds_lightning.envs.build import build_env
+from dds_lightning.tasks import get_task
+
+UPRIGHT, ON_ITS_BACK = 0.5, 0.0
+"""Cosines of the tilt: a body that was above the first and comes below the second has fallen."""
+
+
+@dataclass(frozen=True)
+class RunnerScore:
+    """Returns of whole episodes.
+
+    Attributes:
+        score: Mean D4RL-normalised score.
+        mean_return: Mean return.
+        std_return: Deviation of the returns.
+        mean_steps: Mean length.
+        episodes: How many.
+        sampled: Whether actions were sampled as in training; else they are the policy's means.
+    """
+
+    score: float
+    mean_return: float
+    std_return: float
+    mean_steps: float
+    episodes: int
+    sampled: bool
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain numbers, rounded for files."""
+        return {key: round(value, 2) if isinstance(value, float) else value for key, value in asdict(self).items()}
+
+
+def score_runner(
+    policy: MLPPolicy, behaviour: str, *, episodes: int = 20, seed: int = 0, sampled: bool = False
+) -> RunnerScore:
+    """Play whole episodes side by side.
+
+    Args:
+        policy: Who acts.
+        behaviour: "hopper", "walker2d" or "halfcheetah".
+        episodes: How many; episode i is reset with `seed + i`.
+        seed: Of episodes and sampled actions.
+        sampled: Sample actions as in training.
+    """
+    task = get_task(f"{behaviour}-medium")
+    environments = [build_env(task.env_id) for _ in range(episodes)]
+    rng = np.random.default_rng(seed) if sampled else None
+    observations = np.stack([env.reset(seed=seed + i)[0] for i, env in enumerate(environments)])
+    returns, lengths = np.zeros(episodes), np.zeros(episodes, dtype=np.int64)
+    playing = np.ones(episodes, dtype=bool)
+    while playing.any():
+        actions = policy.act(observations, rng)
+        for i in np.flatnonzero(playing):
+            observations[i], reward, terminated, truncated, _ = environments[i].step(actions[i])
+            returns[i] += float(reward)
+            lengths[i] += 1
+            playing[i] = not (terminated or truncated)
+    for env in environments:
+        env.close()
+    return RunnerScore(
+        score=float(task.normalised_score(returns).mean()),
+        mean_return=float(returns.mean()),
+        std_return=float(returns.std()),
+        mean_steps=float(lengths.mean()),
+        episodes=episodes,
+        sampled=sampled,
+    )
+
+
+@dataclass(frozen=True)
+class WalkScore:
+    """How an Ant follows headings.
+
+    Attributes:
+        action_noise: Deviation of Gaussian noise on its actions.
+        speed: Mean speed along the heading in m/s, time on its back included.
+        upright_speed: The same over the steps of Ants that have not fallen yet.
+        falls_per_1000: Falls in 1,000 steps of bodies that stand.
+        on_its_back: Share of the Ants that lie at the end.
+        steps: Environment steps behind the numbers.
+    """
+
+    action_noise: float
+    speed: float
+    upright_speed: float
+    falls_per_1000: float
+    on_its_back: float
+    steps: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain numbers, rounded for files."""
+        return {key: round(value, 4) for key, value in asdict(self).items()}
+
+
+def score_walker(
+    act: Callable[[NDArray[np.float32]], NDArray[Any]],
+    physics: str,
+    *,
+    action_noise: float = 0.0,
+    ants: int = 64,
+    steps: int = 1000,
+    seed: int = 0,
+    heading_steps: tuple[int, int] | None = None,
+) -> WalkScore:
+    """Let Ants follow changing headings for one long episode each; a fall does not end it.
+
+    Args:
+        act: Features (B, 28) of `ant.see` to actions (B, 8), `MLPPolicy.act` for example.
+        physics: "d4rl" or "robotics".
+        action_noise: Deviation of Gaussian noise on the actions.
+        ants: Episodes.
+        steps: Steps of an episode.
+        seed: Of starts, headings and noise.
+        heading_steps: Fewest and most steps for which a heading holds; by default as in training.
+    """
+    from datamodules.behaviours.training.ant_world import AntWorld, calm
+
+    rules = calm(physics)
+    if heading_steps is not None:
+        rules = replace(rules, heading_steps=heading_steps)
+    world = AntWorld(physics, ants, rules, seed=seed)
+    seen = world.reset()
+    world.noise[:] = action_noise
+    standing = np.ones(ants, dtype=bool)
+    never_fell = np.ones(ants, dtype=bool)
+    falls = standing_steps = 0
+    speed = upright_speed = upright_steps = 0.0
+    for _ in range(steps):
+        world.step_async(act(seen))
+        seen, _, _, _ = world.step_wait()
+        fell = standing & (world.upright < ON_ITS_BACK)
+        standing = np.where(standing, ~fell, world.upright > UPRIGHT)
+        never_fell &= ~fell
+        falls += int(fell.sum())
+        standing_steps += int(standing.sum())
+        speed += world.speed.sum()
+        upright_speed += world.speed[never_fell].sum()
+        upright_steps += never_fell.sum()
+    return WalkScore(
+        action_noise=action_noise,
+        speed=float(speed / (ants * steps)),
+        upright_speed=float(upright_speed / max(upright_steps, 1)),
+        falls_per_1000=1000 * falls / max(standing_steps, 1),
+        on_its_back=float(1.0 - standing.mean()),
+        steps=ants * steps,
+    )
+
+
+def score_navigator(noises: tuple[float, ...], *, episodes: int = 100, seed: int = 0) -> pd.DataFrame:
+    """Let the shipped Ant controller walk from the start to the evaluation's goal, in each of D4RL's mazes.
+
+    Args:
+        noises: Deviations of Gaussian noise on the actions.
+        episodes: Of each maze and noise.
+        seed: Of goals, starts and noise.
+
+    Returns:
+        A row a maze and noise: `maze`, `action_noise`, `episodes`, `reached`, `median_steps` (of those that reached
+        the goal), `cap` (steps after which an episode is over).
+    """
+    from datamodules.collect.antmaze import AntMazeRecipe, AntNavigator
+    from dds_lightning.rollout.actors import Contestant, EveryRow
+    from dds_lightning.rollout.play import rollout
+
+    rows = []
+    for maze in ("umaze", "medium", "large"):
+        task = get_task("antmaze-umaze" if maze == "umaze" else f"antmaze-{maze}-diverse")
+        players = [
+            Contestant(f"{noise:g}", EveryRow(AntNavigator(task, AntMazeRecipe(action_noise=noise))), episodes)
+            for noise in noises
+        ]
+        played = rollout(task, players, seed=seed).episodes
+        for player, noise in zip(players, noises, strict=True):
+            own = played[played["actor"] == player.name]
+            there = own[own["success"].astype(bool)]
+            rows.append(
+                {
+                    "maze": maze,
+                    "action_noise": noise,
+                    "episodes": episodes,
+                    "reached": len(there),
+                    "median_steps": float(there["length"].median()),
+                    "cap": task.max_episode_steps,
+                }
+            )
+    return pd.DataFrame(rows)

@@ -1,0 +1,226 @@
+"""Draws single steps from a recording, with the simulator's state before each, without loading the whole file.
+
+| observations | qpos | qvel |
+|---|---|---|
+| hopper, walker2d, halfcheetah | without x, which no force depends on: 0 | all; cut to +-10 in the first two |
+| antmaze (29), pointmaze (4) | all | all |
+| kitchen, 59 as Minari stores them | all, with noise | all, with noise |
+| kitchen, 60 as D4RL stores them | all, with noise | none: differences of positions |
+
+Where a D4RL file has `infos/qpos` and `infos/qvel` of the same rows, the state comes from there: nothing is cut.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datamodules.sources.rows import Recording, open_recording
+from datamodules.validation import DataError
+from dds_lightning.errors import UserError
+from dds_lightning.tasks import Task
+from dds_lightning.tasks.columns import observation_names
+
+FALLS = 4
+"""In locomotion at most every so-manieth step ends its episode: there versions of an environment differ."""
+
+SPARE = 8
+"""Times as many steps are read where some will not do, because velocities were cut when they were recorded."""
+
+SAME = 1e-3
+"""`infos` and observations of one state differ by no more than this, absolutely or relatively."""
+
+Floats = NDArray[np.float64]
+
+
+class StateLayout(NamedTuple):
+    """Which columns of W recorded numbers are the simulator's state.
+
+    Attributes:
+        names: W names with units.
+        positions: Columns with qpos, in its order.
+        velocities: Columns with qvel; none where they are not recorded.
+        degrees: Entries of qvel.
+        hidden: Entries of qpos before the recorded ones.
+        speed_limit: Recorded velocities are cut to +-this.
+        lead: Steps that a replay begins earlier, so that velocities which had to be estimated are forgotten.
+        noisy: Whether states were recorded with noise.
+        judged: The first so many columns tell whether a recording fits; None takes all. In the kitchen they are the
+            robot's: pushing an object turns the noise on the robot's position into any error.
+    """
+
+    names: tuple[str, ...]
+    positions: tuple[int, ...]
+    velocities: tuple[int, ...]
+    degrees: int
+    hidden: int = 0
+    speed_limit: float = np.inf
+    lead: int = 0
+    noisy: bool = False
+    judged: int | None = None
+
+    def observe(self, qpos: Floats, qvel: Floats) -> Floats:
+        """The W numbers that a recording holds of a state, without noise."""
+        seen = np.zeros(len(self.names))
+        seen[list(self.positions)] = qpos[self.hidden :]
+        seen[list(self.velocities)] = np.clip(qvel, -self.speed_limit, self.speed_limit)[: len(self.velocities)]
+        return seen
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedSteps:
+    """n steps of a recording; L is the layout's `lead`.
+
+    Attributes:
+        layout: What the W columns are.
+        qpos: (n, nq) positions L steps before.
+        qvel: (n, nv) velocities there.
+        observations: (n, L + 1, W) up to the state that the step starts from.
+        actions: (n, L + 1, A).
+        following: (n, W) where the step led; NaN where the file does not say.
+        rewards: (n,).
+        ended: (n,) bool, whether the step terminated its episode.
+        notes: What a reader should know, a sentence each.
+    """
+
+    layout: StateLayout
+    qpos: Floats
+    qvel: Floats
+    observations: Floats
+    actions: Floats
+    following: Floats
+    rewards: Floats
+    ended: NDArray[np.bool_]
+    notes: tuple[str, ...] = ()
+
+
+def state_layout(task: Task, width: int) -> StateLayout:
+    """The layout of a task's recorded observations.
+
+    Args:
+        task: Any task of the table.
+        width: Numbers a row; tells the kitchen's two layouts apart.
+    """
+    names = observation_names(task)
+    if task.family == "kitchen":
+        names = names[:30]
+        if width != 59:
+            return StateLayout(names, tuple(range(30)), (), 29, lead=3, noisy=True, judged=9)
+        rates = tuple(f"{name.partition(' (')[0]} velocity" for name in names[:26])
+        rates += tuple(f"kettle spin about {axis}" for axis in "xyz")
+        columns = (*range(9), *range(18, 39)), (*range(9, 18), *range(39, 59))
+        return StateLayout((*names[:9], *rates[:9], *names[9:], *rates[9:]), *columns, 29, noisy=True, judged=18)
+    known = {"locomotion": (width - 1) // 2, "antmaze": 15, "pointmaze": 2}[task.family]
+    limit = 10.0 if task.base_name.partition("-")[0] in ("hopper", "walker2d") else np.inf
+    hidden = 1 if task.family == "locomotion" else 0
+    return StateLayout(names, tuple(range(known)), tuple(range(known, width)), width - known, hidden, limit)
+
+
+def draw_steps(spec: str, task: Task, count: int, seed: int = 0) -> RecordedSteps:
+    """Draw steps from all over a recording; in locomotion a quarter of them end an episode, if so many do.
+
+    Args:
+        spec: As in `load_trajectories`.
+        task: From `resolve_task`, whose observations and actions the recording has.
+        count: Steps to draw; fewer come back where the recording is shorter.
+        seed: Of the draw.
+
+    Raises:
+        UserError: For a count below 1.
+        DataError: For data that are damaged or another task's, or hold no usable step.
+    """
+    if count < 1:
+        raise UserError(f"steps to replay: found {count}, expected at least 1")
+    rng = np.random.default_rng(seed)
+    with open_recording(spec, task, rng) as recording:
+        return _draw(recording, task, count, rng)
+
+
+# ---------------------------------------------------------------------- drawing
+
+
+def _draw(recording: Recording, task: Task, count: int, rng: np.random.Generator) -> RecordedSteps:
+    layout = state_layout(task, recording.width)
+    falls = task.family == "locomotion"
+    spare = SPARE if np.isfinite(layout.speed_limit) else 1
+    rows, inner = [], []
+    for episode, step in _choose(recording, layout.lead, count * spare, rng, falls=falls):
+        start = step - layout.lead
+        known = step < recording.known[episode]
+        seen = recording.states(episode, start, step + 1 + known)[:, : len(layout.names)]
+        actions, rewards = recording.taken(episode, start, step + 1)
+        fell = bool(recording.ended[episode] and step == recording.steps[episode] - 1)
+        # A repeated state stands for one that nobody recorded.
+        led = seen[-1] if known and not (fell and np.array_equal(*seen[-2:])) else np.full(len(layout.names), np.nan)
+        rows.append((seen[: layout.lead + 1], actions, led, rewards[-1], fell))
+        inner.append(recording.inner(episode, start))
+    columns = [np.array(values, dtype=np.float64) for values in zip(*rows, strict=True)]
+    for name, values in zip(("observations", "actions", "observations", "rewards"), columns, strict=False):
+        if np.isinf(values).any() or (np.isnan(values).any() and values is not columns[2]):
+            raise DataError(f"{recording.where}, {name}: found a number that is not finite")
+    qpos, qvel, whole, notes = _states(layout, columns[0], inner, task.step_seconds)
+    ended = columns[4] > 0
+    few = [rng.permutation(np.flatnonzero(whole & kind)) for kind in (ended & falls, ~(ended & falls))]
+    few[0] = few[0][: count // FALLS]
+    kept = np.sort(np.append(few[0], few[1][: count - len(few[0])]))
+    if not np.isfinite(columns[2][kept]).all(axis=1).any():
+        raise DataError(
+            f"{recording.where}: of {len(rows)} steps none leads from a whole recorded state to another one"
+        )
+    observations, actions, following, rewards = (values[kept] for values in columns[:4])
+    return RecordedSteps(layout, qpos[kept], qvel[kept], observations, actions, following, rewards, ended[kept], notes)
+
+
+def _states(
+    layout: StateLayout, observations: Floats, inner: list[Any], seconds: float
+) -> tuple[Floats, Floats, NDArray[np.bool_], tuple[str, ...]]:
+    """The simulator's states at the start of every replay: qpos, qvel, whether they are whole, and notes."""
+    first = observations[:, 0]
+    whole: NDArray[np.bool_] = np.ones(len(first), bool)
+    if inner[0] is not None and all(_agrees(layout, own, seen) for own, seen in zip(inner, first, strict=True)):
+        qpos, qvel = (np.array(part, dtype=np.float64) for part in zip(*inner, strict=True))
+        return qpos, qvel, whole, ()
+    qpos = np.pad(first[:, list(layout.positions)], ((0, 0), (layout.hidden, 0)))
+    if layout.velocities:
+        qvel = first[:, list(layout.velocities)]
+        return qpos, qvel, whole & (np.abs(qvel) < layout.speed_limit).all(axis=1), ()
+    # Of the kettle's seven position numbers four are a quaternion: it is taken not to spin.
+    rates = (observations[:, 1] - first)[:, list(layout.positions)] / seconds
+    note = (
+        f"the file holds no velocities: they are estimated from positions {layout.lead} steps earlier and mostly "
+        "forgotten since, so the verdict is weaker than with velocities"
+    )
+    return qpos, np.pad(rates[:, :-4], ((0, 0), (0, 3))), whole, (note,)
+
+
+def _agrees(layout: StateLayout, inner: tuple[Floats, Floats], seen: Floats) -> bool:
+    """Whether the simulator's state is that of an observation; D4RL's recorders were not always in step."""
+    if (len(inner[0]), len(inner[1])) != (layout.hidden + len(layout.positions), layout.degrees):
+        return False
+    recorded = [*layout.positions, *layout.velocities]
+    told = layout.observe(*inner)[recorded]
+    near = np.abs(told - seen[recorded]) <= SAME * (1 + np.abs(told))
+    return bool(near.all() and np.isfinite(inner[0]).all())
+
+
+def _choose(
+    recording: Recording, lead: int, count: int, rng: np.random.Generator, *, falls: bool
+) -> list[tuple[int, int]]:
+    """(episode, step) of the steps to read, in the order of the file; each has `lead` steps before it."""
+    ends = np.flatnonzero(recording.ended & (recording.steps > lead)) if falls else np.zeros(0, np.int64)
+    ends = rng.permutation(ends)[: count // FALLS]
+    room = np.maximum(recording.known - lead, 0)
+    total = int(room.sum())
+    drawn = np.zeros(0, np.int64)
+    if total:
+        drawn = np.sort(rng.choice(total, min(count - len(ends), total), replace=False))
+    episode = np.searchsorted(np.cumsum(room), drawn, side="right")
+    step = drawn - (np.cumsum(room) - room)[episode] + lead
+    pairs = {(int(e), int(t)) for e, t in zip(episode, step, strict=True)}
+    pairs |= {(int(e), int(recording.steps[e]) - 1) for e in ends}
+    if not pairs:
+        raise DataError(f"{recording.where}: no step leads to a recorded state, so nothing can be replayed")
+    return sorted(pairs)

@@ -1,0 +1,211 @@
+"""The semi-MDP transitions as a data module: relabel once, keep the result on disk, serve batches from memory."""
+
+import hashlib
+import json
+import logging
+import os
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as pl
+import torch
+from torch import Tensor
+
+from datamodules.loader import TensorLoader
+from datamodules.partial_codes import KeptCodes
+from datamodules.relabel import Discount, Relabelled, relabel, relabel_key
+from datamodules.sources import load_trajectories, resolve_task
+from datamodules.trajectories import Trajectories
+from dds_lightning.errors import UserError
+from dds_lightning.skill import SkillModule
+from dds_lightning.tasks import Task, get_task
+
+log = logging.getLogger(__name__)
+
+
+class RelabeledDataModule(pl.LightningDataModule):
+    """Semi-MDP transitions of a data set under the skills of a checkpoint.
+
+    Relabelling runs once: its result lies under ``cache`` in a file named after the hash of data, skill weights, H,
+    gamma, discount, stride and reward convention, so that nothing stale is ever read.
+
+    Args:
+        task: name of a task (``dds tasks``); null for your own data. The attribute ``task`` is, after ``setup``, the
+            variant in which the data were recorded.
+        data: where the data are, e.g. ``local:DIR``, ``minari:ID`` or ``d4rl:FILE``.
+        skill: skill checkpoint: a Lightning ``.ckpt`` or a published directory.
+        relabelled: read this file (of ``dds relabel``) instead of the cache; refused if made from anything else.
+        cache: folder of the cache; null puts it beside the skill checkpoint, or in the user's cache folder where that
+            is a published directory.
+        gamma: discount a step.
+        discount: ``per_skill`` bootstraps with gamma (the paper), ``per_step`` with gamma^h.
+        stride: steps between the starts of two segments.
+        reward_scale: overrides the task's factor on the learning reward.
+        reward_shift: overrides the task's shift of the learning reward.
+        batch_size: transitions a batch.
+        validation_fraction: share of the episodes held out.
+        seed: of the split and of the order.
+        device_resident: keep the transitions on the accelerator.
+    """
+
+    hparams: Any  # Lightning gives its settings as attributes, but types them as a mapping
+
+    def __init__(
+        self,
+        task: str | None = None,
+        data: str | None = None,
+        skill: str | None = None,
+        relabelled: str | None = None,
+        cache: str | None = None,
+        gamma: float = 0.99,
+        discount: Discount = "per_skill",
+        stride: int = 1,
+        reward_scale: float | None = None,
+        reward_shift: float | None = None,
+        batch_size: int = 256,
+        validation_fraction: float = 0.05,
+        seed: int = 0,
+        device_resident: bool = False,
+    ) -> None:
+        super().__init__()
+        self.save_hyperparameters()
+        self.task: Task | None = get_task(task) if task else None
+        if skill is None:
+            raise UserError("data.skill is missing: give the skill checkpoint (.ckpt or directory) to relabel with")
+        if not 0.0 <= validation_fraction < 1.0:
+            raise UserError(f"data.validation_fraction is {validation_fraction}, expected a share in [0, 1)")
+        self.skill = SkillModule.load(skill)
+        self.observation_dim: int = self.skill.hparams.observation_dim
+        self.num_skills: int = self.skill.num_skills
+        self.skill_hash = self.skill.fingerprint()
+        self.transitions: Relabelled | None = None
+        self._given: Trajectories | None = None
+
+    @classmethod
+    def from_trajectories(cls, trajectories: Trajectories, skill: str, **settings: Any) -> "RelabeledDataModule":
+        """Build the module over trajectories already in memory."""
+        module = cls(skill=skill, **settings)
+        module._given = trajectories
+        return module
+
+    @cached_property
+    def trajectories(self) -> Trajectories:
+        """The data set, loaded at first use; from then on ``task`` is the variant it was recorded in."""
+        if self._given is not None:
+            return self._given
+        if self.hparams.data is None:
+            raise UserError(
+                "data.data is missing: give local:DIR, minari:ID or d4rl:FILE, or collect with `dds data collect TASK`"
+            )
+        if self.task is not None:
+            self.task = resolve_task(self.hparams.data, self.task)
+        return load_trajectories(self.hparams.data, self.task)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What relabelling depends on beside data and skills."""
+        h = self.hparams
+        scale = self.task.reward_scale if self.task else 1.0
+        shift = self.task.reward_shift if self.task else 0.0
+        return {
+            "gamma": h.gamma,
+            "discount": h.discount,
+            "stride": h.stride,
+            "reward_scale": scale if h.reward_scale is None else h.reward_scale,
+            "reward_shift": shift if h.reward_shift is None else h.reward_shift,
+        }
+
+    @cached_property
+    def key(self) -> dict[str, str | int | float]:
+        """Everything the relabelled data depend on; hashes data and weights, so worked out once."""
+        return relabel_key(self.trajectories, self.skill, **self.settings)
+
+    def cache_file(self) -> Path:
+        """Where the relabelled data of exactly these inputs lie."""
+        name = hashlib.sha256(json.dumps(self.key, sort_keys=True).encode()).hexdigest()[:16]
+        return self._cache_folder() / f"relabelled-{name}.safetensors"
+
+    def _cache_folder(self) -> Path:
+        """The folder asked for, else beside a training's checkpoint; nothing is added to a published directory."""
+        if self.hparams.cache:
+            return Path(self.hparams.cache)
+        skill = Path(self.hparams.skill)
+        if not skill.is_dir():
+            return skill.parent
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dds-lightning"
+
+    def prepare_data(self) -> None:
+        """Relabel, unless the result of exactly these inputs is on disk."""
+        if self.hparams.relabelled is None and not self.cache_file().exists():
+            self.relabel_into(self.cache_file())
+
+    def relabel_into(self, path: Path) -> Relabelled:
+        """Relabel and write the result to `path`; a call that was stopped goes on when it is made again."""
+        kept = KeptCodes(path, self.key)
+        made = relabel(self.trajectories, self.skill, **self.settings, progress=True, kept=kept)
+        made.save(path, self.key)
+        kept.remove()
+        log.info("relabelled %d segments into %s", len(made), path)
+        return made
+
+    def setup(self, stage: str | None = None) -> None:
+        """Read the transitions and split them by episode."""
+        if self.transitions is not None:
+            return
+        path = Path(self.hparams.relabelled) if self.hparams.relabelled else self.cache_file()
+        self.transitions = Relabelled.load(path, self.key)
+        h = self.hparams
+        _, held_out = self.trajectories.split(h.validation_fraction, h.seed, self.skill.horizon)
+        kept = torch.isin(self.transitions.episodes, torch.as_tensor(held_out))
+        self.train_index, self.validation_index = (
+            torch.nonzero(~kept).flatten(),
+            torch.nonzero(kept).flatten(),
+        )
+
+    def statistics(self) -> dict[str, Any]:
+        """What the policy keeps of the data: normalisation, code shares, range of rewards, greatest discount."""
+        assert self.transitions is not None, "setup() comes first"
+        t, i = self.transitions, self.train_index
+        observations, rewards = t.observations[i], t.rewards[i]
+        counts = torch.bincount(t.codes[i], minlength=self.num_skills).float()
+        return {
+            "observation_mean": observations.mean(dim=0),
+            "observation_std": observations.std(dim=0),
+            "code_share": counts / counts.sum(),
+            "reward_range": (rewards.min().item(), rewards.max().item()),
+            "max_discount": t.discounts[i].max().item(),
+        }
+
+    def _loader(self, index: Tensor, train: bool = False) -> TensorLoader:
+        assert self.transitions is not None, "setup() comes first"
+        trainer = self.trainer
+        device = torch.device("cpu")
+        if self.hparams.device_resident and trainer is not None:
+            device = trainer.strategy.root_device
+        transitions, rows = self.transitions.to(device), index.to(device)
+
+        def gather(chosen: Tensor) -> dict[str, Tensor]:
+            return transitions.batch(rows[chosen])
+
+        h = self.hparams
+        options: dict[str, Any] = {"device": device}
+        if train:
+            rank, world = (trainer.global_rank, trainer.world_size) if trainer is not None else (0, 1)
+            options |= {"shuffle": True, "seed": h.seed, "drop_last": True, "rank": rank, "world_size": world}
+        return TensorLoader(gather, len(index), h.batch_size, **options)
+
+    def train_dataloader(self) -> TensorLoader:
+        """Shuffled batches; the order is a function of seed and epoch."""
+        return self._loader(self.train_index, train=True)
+
+    def val_dataloader(self) -> TensorLoader | list[Any]:
+        """The held-out episodes' transitions, in order; none when ``validation_fraction`` is 0."""
+        return self._loader(self.validation_index) if len(self.validation_index) else []
+
+    test_dataloader = val_dataloader
+
+    def predict_dataloader(self) -> TensorLoader:
+        """Every transition, in order."""
+        assert self.transitions is not None, "setup() comes first"
+        return self._loader(torch.arange(len(self.transitions)))

@@ -1,0 +1,82 @@
+"""Import paths of earlier versions: each still gives the module that now holds what it held."""
+
+import sys
+import warnings
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+
+_DRAW = (
+    *("bars", "charts", "clip", "curves", "dataset", "drawing", "gif"),
+    *("maze", "palette", "png", "rendering", "stitching", "strobe", "values"),
+)
+_MEASURE = ("body", "comparison", "information", "recovery", "replay", "statistics")
+
+MOVED = {
+    "dds_lightning.reports": "dds_lightning.console.reports",
+    "dds_lightning.training.interrupts": "dds_lightning.console.interrupts",
+    "dds_lightning.files": "dds_lightning.saving.files",
+    "dds_lightning.checkpointing": "dds_lightning.saving.checkpoint",
+    "dds_lightning.publishing": "dds_lightning.saving.published",
+    "dds_lightning.hub": "dds_lightning.saving.hub",
+    "dds_lightning.stages": "dds_lightning.saving.run_directory",
+    "dds_lightning.actors": "dds_lightning.rollout.actors",
+    "dds_lightning.seating": "dds_lightning.rollout.schedule",
+    "dds_lightning.results": "dds_lightning.rollout.result",
+    "dds_lightning.metrics": "dds_lightning.nn.usage",
+    "dds_lightning.run": "dds_lightning.pipeline.run",
+    "dds_lightning.run_settings": "dds_lightning.pipeline.settings",
+    "dds_lightning.export": "dds_lightning.sharing.export",
+    "dds_lightning.verification": "dds_lightning.sharing.verify",
+    "dds_lightning.envs.adapters": "dds_lightning.tasks.env",
+    "dds_lightning.tasks.layout": "dds_lightning.tasks.columns",
+    "dds_lightning.training.fitting": "dds_lightning.training.stage_cli",
+    "dds_lightning.callbacks.evaluation": "dds_lightning.callbacks.rollouts",
+    "dds_lightning.study.baselines": "dds_lightning.baselines.behaviour_cloning",
+    "dds_lightning.study.evaluation": "dds_lightning.study.evaluate",
+    "dds_lightning.study.replays": "dds_lightning.study.skill_replays",
+    "dds_lightning.study.atlas": "dds_lightning.study.subject",
+    "dds_lightning.interpret.atlas_page": "dds_lightning.interpret.atlas.page",
+    "dds_lightning.interpret.atlas_pictures": "dds_lightning.interpret.atlas.pictures",
+    "datamodules.kept_codes": "datamodules.partial_codes",
+    "datamodules.relabeled": "datamodules.relabelled",
+    "datamodules.replay": "datamodules.physics.check",
+    "datamodules.resimulate": "datamodules.physics.resimulate",
+    "datamodules.sources.states": "datamodules.physics.states",
+    "datamodules.sources.recordings": "datamodules.sources.rows",
+    "datamodules.signature": "datamodules.sources.stat_hash",
+    "datamodules.sources.belonging": "datamodules.sources.plausibility",
+    "datamodules.behaviours.fast_ppo": "datamodules.behaviours.training.fast_ppo",
+    "datamodules.behaviours.learner": "datamodules.behaviours.training.learner",
+    "datamodules.behaviours.recipes": "datamodules.behaviours.training.recipes",
+    "datamodules.behaviours.worlds": "datamodules.behaviours.training.worlds",
+    "datamodules.behaviours.ant_world": "datamodules.behaviours.training.ant_world",
+    "datamodules.behaviours.evaluation": "datamodules.behaviours.training.evaluation",
+    "dds_lightning.optim": "dds_lightning.module",
+    **{f"dds_lightning.interpret.{name}": f"dds_lightning.interpret.draw.{name}" for name in _DRAW},
+    **{f"dds_lightning.interpret.{name}": f"dds_lightning.interpret.measure.{name}" for name in _MEASURE},
+}
+"""Old path of a module -> where it is now."""
+
+
+class _Redirect(MetaPathFinder, Loader):
+    """Answers for the old paths, after every other finder has said that it knows no such module."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        return ModuleSpec(fullname, self, origin=MOVED[fullname]) if fullname in MOVED else None
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Put the module of the new path in the place of the empty one that Python has made."""
+        old = module.__name__
+        warnings.warn(f"{old} has moved to {MOVED[old]}", DeprecationWarning, stacklevel=2)
+        sys.modules[old] = import_module(MOVED[old])
+
+
+def redirect_old_paths() -> None:
+    """Let the old paths be imported; harmless when repeated."""
+    if not any(isinstance(finder, _Redirect) for finder in sys.meta_path):
+        sys.meta_path.append(_Redirect())

@@ -1,0 +1,192 @@
+"""The skill atlas: everything about the skills of one checkpoint, measured, drawn, and written as one HTML file.
+
+```
+ data ──► code_segments ──► skill_table, transitions, where     ┐
+ states ─► replay_codes ──► trajectories, strobes, clips         ├─► Atlas ─► atlas_page.page ─► atlas.html
+        └► code_recovery ─► confusion, accuracy, information     │
+ rollout ─► stitching, single skills · policy ─► value map       ┘
+```
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from datamodules.trajectories import Trajectories
+from dds_lightning.interpret.atlas.pictures import Picture, Studio, Tell
+from dds_lightning.interpret.draw import charts
+from dds_lightning.interpret.measure import statistics
+from dds_lightning.interpret.measure.comparison import compare_recovery
+from dds_lightning.interpret.measure.recovery import Recovery, RoundTrip, code_recovery, round_trip
+from dds_lightning.interpret.measure.replay import draw_states, simulator
+from dds_lightning.rollout.result import RolloutResult
+from dds_lightning.tasks import Task
+
+if TYPE_CHECKING:
+    from dds_lightning.agent import DDSAgent
+    from dds_lightning.skill import SkillModule
+
+STATES, STARTS = 32, 8
+"""States from which codes are recovered, and among which the start of a body's pictures is chosen."""
+DISCRETE, CONTINUOUS = "discrete skills", "continuous skills, clustered"
+"""What models that are compared are called, by kind."""
+RARE = 0.1
+"""A code is in use when it holds this share of 1 / K of the data."""
+
+
+@dataclass(frozen=True, eq=False)
+class Atlas:
+    """What is known of a checkpoint's skills.
+
+    Attributes:
+        task: where they were replayed.
+        horizon: H.
+        table: a row a code: `statistics.skill_table` with `spread` and `apart` (`decoder_diversity`), `nearest` and
+            `near` (code and its distance in the codebook), `again` and `recovered` (shares of the round trip's and of
+            the recovery's replays; NaN for codes out of use), and, where they played alone, `alone` (per cent that
+            succeed, else the normalised score) and `alone_episodes`.
+        trip: codes told from behaviour in states where the data use them.
+        recovery: the same from any state, of the codes in use.
+        transitions: (K, K), see `statistics.transition_matrix`.
+        distances: (K, K), see `statistics.code_distances`.
+        comparison: of `recovery.compare_recovery`, if there were other models.
+        segments: number of segments of the data that were encoded.
+        pictures: of the page, by name.
+        clips: code to its clip.
+    """
+
+    task: Task
+    horizon: int
+    table: pd.DataFrame
+    trip: RoundTrip
+    recovery: Recovery
+    transitions: NDArray[np.float64]
+    distances: NDArray[np.float64]
+    comparison: pd.DataFrame | None
+    segments: int
+    pictures: dict[str, Picture]
+    clips: dict[int, Picture]
+
+    def facts(self) -> dict[str, Any]:
+        """The numbers, without pictures."""
+        trip, recovery = (
+            {**found.facts(), "confusion": found.confusion, "replayed": found.codes}
+            for found in (self.trip, self.recovery)
+        )
+        return {
+            "task": self.task.name,
+            "horizon": self.horizon,
+            "num_skills": len(self.table),
+            "segments": self.segments,
+            "skills": self.table,
+            "round_trip": trip,
+            "recovery": recovery,
+            "transitions": self.transitions,
+            "distances": self.distances,
+            "comparison": self.comparison,
+        }
+
+
+def make_atlas(
+    agent: DDSAgent,
+    task: Task,
+    trajectories: Trajectories,
+    result: RolloutResult | None = None,
+    main: str | None = None,
+    singles: str | None = None,
+    others: Sequence[tuple[str, SkillModule]] = (),
+    states: int = STATES,
+    segments: int = 20_000,
+    seed: int = 0,
+    tell: Tell = lambda words: None,
+) -> Atlas:
+    """Measure and draw everything.
+
+    Args:
+        agent: the skills; its policy too, if it has one.
+        task: where they are replayed.
+        trajectories: the data of that task.
+        result: episodes of the policy and of single skills, with paths; without it they are left out.
+        main: the contestant of `result` whose episodes are shown.
+        singles: the contestant of `result` whose parts are single skills.
+        others: names and models to compare with, see `recovery.compare_recovery`.
+        states: from which every code is replayed to be recovered, and segments for each code's round trip.
+        segments: of the data that are encoded, about.
+        seed: of every draw.
+        tell: told what is being done.
+
+    Raises:
+        UserError: model and data do not fit.
+    """
+    skill = agent.skill
+    tell("encoding the data")
+    coded = statistics.code_segments(skill, trajectories, segments, seed)
+    table = statistics.skill_table(task, coded, agent.policy)
+    used = np.flatnonzero(coded.share >= RARE / skill.num_skills)
+    distances = statistics.code_distances(skill)
+    table["nearest"] = statistics.nearest_codes(distances)
+    table["near"] = distances[np.arange(len(distances)), table["nearest"]]
+    drawn = draw_states(task, trajectories, states, seed)
+    spread = statistics.decoder_diversity(skill, drawn.observations, noise_scale=agent.noise_scale, seed=seed)
+    table[["spread", "apart"]] = spread[["spread", "apart"]]
+    with simulator(task) as env:
+        tell("telling codes from behaviour")
+        trip = round_trip(task, skill, trajectories, states, agent.noise_scale, seed, env)
+        recovery, _ = code_recovery(task, skill, drawn, used, agent.noise_scale, seed, env)
+        for name, codes, shares in (
+            ("again", trip.codes, trip.by_code),
+            ("recovered", used, np.diag(recovery.confusion)),
+        ):
+            table[name] = pd.Series(shares, index=codes).reindex(table["code"]).to_numpy()
+        if singles is not None and result is not None:
+            table = table.join(_alone(task, result, singles), on="code")
+        studio = Studio(task, agent, env, seed, tell)
+        studio.skills(table, used, drawn.take(np.arange(min(STARTS, len(drawn)))))
+        if result is not None and main is not None:
+            studio.episodes(result, main)
+        studio.values()
+    tell("drawing")
+    transitions = statistics.transition_matrix(coded)
+    studio.diversity(table)
+    studio.matrices(trip, recovery, transitions, distances, coded)
+    comparison = None
+    if others:
+        rows = [(DISCRETE, skill), *others]
+        comparison = compare_recovery(
+            task, trajectories, rows, skill.num_skills, states, seed, lambda name: tell(f"comparing: {name}")
+        )
+        studio.keep(
+            "comparison",
+            charts.plot_comparison(comparison),
+            "A dot is a model, a bar the mean of those of one name. Continuous skills were put into "
+            f"{skill.num_skills} clusters, whose centres were replayed.",
+            "Bars of round trip, recovery and information of each model, with control, chance and limit marked.",
+        )
+    return Atlas(
+        task=task,
+        horizon=skill.horizon,
+        table=table,
+        trip=trip,
+        recovery=recovery,
+        transitions=transitions,
+        distances=distances,
+        comparison=comparison,
+        segments=len(coded.codes),
+        pictures=studio.pictures,
+        clips=studio.clips,
+    )
+
+
+def _alone(task: Task, result: RolloutResult, singles: str) -> pd.DataFrame:
+    """How each skill does by itself, indexed by code."""
+    played = result.episodes[result.episodes["actor"] == singles]
+    groups = played.groupby("final_code")
+    goal = task.measures_success and not task.subtasks
+    mean = 100 * groups["success"].mean().astype(float) if goal else groups["score"].mean()
+    return pd.DataFrame({"alone": mean, "alone_episodes": groups.size()})

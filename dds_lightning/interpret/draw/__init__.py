@@ -1,0 +1,1 @@
+"""Figures: every function draws from tables and arrays that are given to it."""

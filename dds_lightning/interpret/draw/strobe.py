@@ -1,0 +1,217 @@
+"""Stroboscopic pictures and clips of moving bodies: stick figures of the model's own limbs (the paper's figure 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from dds_lightning.errors import UserError
+from dds_lightning.interpret.draw.drawing import LABEL, TICKS, draw_walls, grid, heading
+from dds_lightning.interpret.draw.gif import Still, gif_bytes
+from dds_lightning.interpret.draw.palette import NO_SKILL, WALL, skill_colour
+from dds_lightning.interpret.measure.body import ABOVE, BodyFrames, View, view_of
+from dds_lightning.tasks import Task
+
+WIDTH = 7.0
+"""Inches of a figure."""
+FAINTEST = 0.16
+"""How solid the first body of a series is; the last one is 1."""
+MARGIN = 0.25
+"""Metres round what is drawn."""
+WIDE = 3.5
+"""Panels wider than this times their height stand one below the other."""
+ROUND = np.linspace(-np.pi / 2, np.pi / 2, 7)
+"""Angles at which the round end of a limb has its corners."""
+
+Floats = NDArray[np.float64]
+
+
+def plot_strobes(
+    task: Task, frames: Mapping[int, BodyFrames], every: int, step_seconds: float | None = None, title: str = ""
+) -> Figure:
+    """A body under several skills: where it is every so many steps, the way of each joint between, the last one solid.
+
+    All panels have one scale. A runner is seen from the side, an ant from above between the walls, the kitchen's arm
+    from behind with what it can move.
+
+    Args:
+        task: the environment.
+        frames: code to T + 1 frames, all from the same state; one panel each, in this order.
+        every: steps between two drawn bodies.
+        step_seconds: seconds of a step; without it the task's.
+        title: above the panels; without it what is drawn.
+
+    Raises:
+        UserError: there is nothing to draw.
+    """
+    if not frames or every < 1:
+        raise UserError(f"frames are of {len(frames)} skills, every is {every}: expected at least one skill and step")
+    view = view_of(task)
+    seconds = task.step_seconds if step_seconds is None else step_seconds
+    low, high = _window(view, list(frames.values()))
+    across, up = high - low
+    columns = 1 if across > WIDE * up else 2
+    wide = WIDTH / min(columns, len(frames))
+    figure, axes = grid(len(frames), wide, (wide - 0.6) * up / across + 0.72, columns)
+    for ax, (code, body) in zip(axes, frames.items(), strict=True):
+        _scene(ax, task, view, body)
+        last = len(body) - 1
+        for t in range(last % every, last + 1, every):  # the last one is always there
+            colour = to_rgba(skill_colour(code), FAINTEST + (1 - FAINTEST) * (t / max(last, 1)) ** 1.5)
+            _draw_body(ax, view, body, t, colour)
+        faint = 0.35 if view == ABOVE else 0.8  # an ant has many joints
+        for path in np.moveaxis(body.joints[:, :, view.axes], 1, 0):  # (J, T + 1, 2)
+            ax.plot(*path.T, color=NO_SKILL, linewidth=0.7, alpha=faint, zorder=4)
+        if view == ABOVE:
+            ax.plot(*body.root[:, view.axes].T, color="black", linewidth=1.2, zorder=5)
+        if len(body.names):
+            _draw_objects(ax, view, body, skill_colour(code))
+        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+        ax.tick_params(labelsize=TICKS - 2)
+        falls = view.ground and len(body) < max(map(len, frames.values()))
+        heading(ax, code, _moved(task, body, seconds, falls))
+        ax.set_xlabel(view.labels[0], fontsize=LABEL - 2)
+        ax.set_ylabel(view.labels[1], fontsize=LABEL - 2)
+        ax.yaxis.set_major_locator(MaxNLocator(nbins=5))
+        ax.label_outer()
+        ax.tick_params(labelbottom=True, labelleft=True)
+    shown_title = title or f"Each skill from the same state, a body every {every * seconds:g} s"
+    figure.suptitle(shown_title, fontsize=LABEL - 1)
+    return figure
+
+
+def body_clip(
+    task: Task, body: BodyFrames, code: int, frames: int = 36, fps: int = 12, size: float = 2.9, seconds: float = 0.0
+) -> bytes:
+    """A moving stick figure as an animated GIF.
+
+    Args:
+        task: the environment.
+        body: T + 1 frames.
+        code: of the skill; gives the colour.
+        frames: at most this many pictures.
+        fps: pictures a second.
+        size: width in inches at 80 dots an inch.
+        seconds: of a step; 0 takes the task's.
+    """
+    view, seconds = view_of(task), seconds or task.step_seconds
+    shown = np.unique(np.linspace(0, len(body) - 1, min(frames, len(body))).round().astype(int))
+    follows = view.ground
+    low, high = _window(view, [_centred(body) if follows else body])
+    tall = float(np.clip(size * (high[1] - low[1]) / (high[0] - low[0]), 1.2, 0.8 * size)) + 0.3
+    if follows:  # the ground goes on to both sides
+        half = max((high[1] - low[1]) * size / (tall - 0.3), high[0] - low[0]) / 2
+        low[0], high[0] = np.array([-half, half]) + (low[0] + high[0]) / 2
+    figure = Figure(figsize=(size, tall), dpi=80)
+    ax = figure.add_axes((0.0, 0.0, 1.0, (tall - 0.3) / tall))
+    _scene(ax, task, view, body)
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[], xlabel="", ylabel="")
+    ax.spines[:].set_visible(False)
+    limbs = PolyCollection([], facecolor=skill_colour(code), edgecolor="white", linewidth=0.5, zorder=3)
+    marks = LineCollection([], color=NO_SKILL, linewidth=1.0, zorder=2)
+    for artist in (limbs, marks):
+        ax.add_collection(artist)
+    (joints,) = ax.plot([], [], ".", color="black", markersize=3, zorder=4)
+    (things,) = ax.plot([], [], "s", color=NO_SKILL, markersize=4, zorder=2)
+    caption = figure.text(0.03, 1 - 0.08 / tall, "", fontsize=8.5, va="top")
+    still = Still(figure, (marks, limbs, joints, things, caption))
+    pictures = []
+    for t in shown:
+        offset = np.array([body.root[t, view.axes[0]], 0.0]) if follows else np.zeros(2)
+        limbs.set_verts(list(_capsules(body, t, view) - offset))
+        joints.set_data(*(body.joints[t][:, view.axes] - offset).T)
+        things.set_data(*body.objects[t][:, view.axes].T)
+        if follows:  # a mark on the ground every half metre tells the speed
+            left, right = ax.get_xlim()
+            places = np.arange(np.ceil((left + offset[0]) * 2) / 2, right + offset[0], 0.5) - offset[0]
+            marks.set_segments([[(x, 0.0), (x, -0.07)] for x in places])
+        caption.set_text(f"skill {code}   {t * seconds:4.2f} s   {_travel(view, body, t)}")
+        pictures.append(still.frame())
+    return gif_bytes(pictures, fps, colours=64)
+
+
+# ---------------------------------------------------------------------- parts
+
+
+def _scene(ax: Axes, task: Task, view: View, body: BodyFrames) -> None:
+    """What does not move: walls, or the ground."""
+    if task.maze_map is not None:
+        draw_walls(ax, task)
+    elif view.ground:
+        ax.axhline(0.0, color=NO_SKILL, linewidth=0.8, zorder=1)
+        ax.axhspan(-10.0, 0.0, color=WALL, zorder=0)
+        ax.spines[["top", "right"]].set_visible(False)
+    if len(body.names):
+        for place, name in zip(body.objects[0][:, view.axes], body.names, strict=True):
+            ax.plot(*place, "s", color=WALL, markeredgecolor=NO_SKILL, markersize=4, zorder=1)
+            if name and not name.startswith(("burner", "knob")):
+                put = partial(ax.annotate, textcoords="offset points", ha="center", fontsize=7, color=NO_SKILL)
+                put(name, place, (0, 5))
+
+
+def _draw_body(ax: Axes, view: View, body: BodyFrames, t: int, colour: Any) -> None:
+    polygons = list(_capsules(body, t, view))
+    ax.add_collection(PolyCollection(polygons, facecolor=colour, edgecolor=(1, 1, 1, 0.7), linewidth=0.4, zorder=3))
+    ax.plot(*body.joints[t][:, view.axes].T, ".", color="black", markersize=2.2, alpha=float(colour[3]), zorder=4)
+
+
+def _draw_objects(ax: Axes, view: View, body: BodyFrames, colour: str) -> None:
+    """The way of what the arm moved."""
+    for path in np.moveaxis(body.objects[:, :, view.axes], 1, 0):
+        if np.linalg.norm(path[-1] - path[0]) > 0.01:
+            ax.plot(*path.T, color=colour, linewidth=2.0, zorder=2)
+            ax.plot(*path[-1], "s", color=colour, markersize=5, zorder=2)
+
+
+def _capsules(body: BodyFrames, t: int, view: View) -> Floats:
+    """Outlines (L, P, 2) of the limbs as they are seen."""
+    ends = body.limbs[t][:, :, view.axes]  # (L, 2, 2)
+    along = ends[:, 1] - ends[:, 0]
+    angle = np.arctan2(along[:, 1], along[:, 0])[:, None]  # (L, 1)
+    radius = (body.widths / 2)[:, None, None]
+    front = radius * np.stack([np.cos(angle + ROUND), np.sin(angle + ROUND)], axis=-1)  # (L, 7, 2)
+    return np.concatenate([ends[:, 1:] + front, ends[:, :1] - front], axis=1)
+
+
+def _centred(body: BodyFrames) -> BodyFrames:
+    """The body with its root at x = 0 all the time."""
+    shift = np.zeros_like(body.root)
+    shift[:, 0] = body.root[:, 0]
+    limbs, joints = body.limbs - shift[:, None, None], body.joints - shift[:, None]
+    return BodyFrames(limbs, body.widths, joints, body.root - shift, body.objects, body.names)
+
+
+def _window(view: View, bodies: list[BodyFrames]) -> tuple[Floats, Floats]:
+    """Lower left and upper right corner (2,) of what some bodies need, with the ground and the objects."""
+    points = [body.limbs[..., view.axes].reshape(-1, 2) for body in bodies]
+    points += [body.objects[..., view.axes].reshape(-1, 2) for body in bodies]
+    everything = np.concatenate(points)
+    low, high = everything.min(axis=0) - MARGIN, everything.max(axis=0) + MARGIN
+    if view.ground:
+        low[1] = -0.15
+    return low, high
+
+
+def _travel(view: View, body: BodyFrames, t: int) -> str:
+    """How far the root has come by frame t."""
+    away = (body.root[t] - body.root[0])[list(view.axes)]
+    return f"{away[0]:+.2f} m" if view.ground else f"{np.linalg.norm(away):.2f} m"
+
+
+def _moved(task: Task, body: BodyFrames, seconds: float, falls: bool) -> str:
+    """A panel's words: how long, how far, how fast, or that it falls."""
+    view, last = view_of(task), len(body) - 1
+    away = (body.root[-1] - body.root[0])[list(view.axes)]
+    far = away[0] if view.ground else np.linalg.norm(away)
+    what = "hand moves" if len(body.names) else "moves"
+    end = "then falls" if falls else f"{far / max(last * seconds, 1e-9):.1f} m/s"
+    return f"{what} {far:.2f} m in {last * seconds:.2g} s ({end})"

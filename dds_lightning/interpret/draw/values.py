@@ -1,0 +1,153 @@
+"""What a critic believes and a policy does all over a maze: V as a heat map, the likeliest code and where it leads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+import torch
+from matplotlib.colors import BoundaryNorm
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from numpy.typing import NDArray
+
+from dds_lightning.errors import UserError
+from dds_lightning.interpret.draw.drawing import LABEL, draw_number, draw_walls, maze_figure
+from dds_lightning.interpret.measure.replay import at_rest, replay_codes, rest_states
+from dds_lightning.tasks import Task
+
+if TYPE_CHECKING:
+    from dds_lightning.agent import DDSAgent
+    from dds_lightning.policy import PolicyModule
+
+ValueFunction = Callable[[NDArray[np.float32]], NDArray[np.float32]]
+"""Observations (N, O) to values (N,)."""
+CodeFunction = Callable[[NDArray[np.float32]], NDArray[np.int64]]
+"""Observations (N, O) to codes (N,)."""
+
+BANDS = 12
+"""Colours of the value map."""
+STAYS = 0.02
+"""An arrow shorter than this share of a cell is not drawn: the skill leads nowhere from there."""
+
+
+def value_and_codes(policy: PolicyModule) -> tuple[ValueFunction, CodeFunction]:
+    """V and the likeliest code of a policy as functions of NumPy observations (N, O)."""
+    policy.eval()
+    device = next(policy.parameters()).device
+
+    @torch.inference_mode()
+    def value(observations: NDArray[np.float32]) -> NDArray[np.float32]:
+        return policy.v(torch.from_numpy(observations).to(device)).cpu().numpy()
+
+    @torch.inference_mode()
+    def codes(observations: NDArray[np.float32]) -> NDArray[np.int64]:
+        return policy.codes(torch.from_numpy(observations).to(device), selection="greedy").cpu().numpy()
+
+    return value, codes
+
+
+def value_table(task: Task, agent: DDSAgent, steps: int | None = None, seed: int = 0, env: Any = None) -> pd.DataFrame:
+    """The critic and the policy in every free cell, for a body at rest in its middle.
+
+    Args:
+        task: a maze.
+        agent: with a policy.
+        steps: that the likeliest code is held, to see where it leads; None takes H.
+        seed: of the decoder's noise.
+        env: from `replay.simulator`, if there is one already.
+
+    Returns:
+        A row a free cell: `row`, `column`, `x`, `y` (m), `value`, `code` (the likeliest), `probability` of it, `dx` and
+        `dy` (m, where it led).
+
+    Raises:
+        UserError: no maze, or no policy.
+    """
+    if agent.policy is None:
+        raise UserError("the agent has no policy: there are no values and no choices to map")
+    cells = task.free_cells()
+    places = task.cell_to_xy(list(cells))
+    observations = at_rest(task, places)
+    value, codes = value_and_codes(agent.policy)
+    chosen = codes(observations)
+    with torch.inference_mode():
+        chances = agent.policy.logits(torch.from_numpy(observations).to(agent.device)).softmax(dim=-1).cpu().numpy()
+    made = replay_codes(
+        task, agent.skill, rest_states(task, cells), chosen, steps, agent.noise_scale, seed, env, each=True
+    )
+    moved = made.qpos[np.arange(len(cells)), made.lengths, :2] - places
+    rows, columns = np.array(cells).T
+    table = {"row": rows, "column": columns, "x": places[:, 0], "y": places[:, 1], "value": value(observations)}
+    table |= {"code": chosen, "probability": chances[np.arange(len(cells)), chosen]}
+    return pd.DataFrame({**table, "dx": moved[:, 0], "dy": moved[:, 1]})
+
+
+def plot_policy_map(task: Task, agent: DDSAgent, steps: int | None = None, seed: int = 0, env: Any = None) -> Figure:
+    """`plot_value_map` of an agent, with arrows that show where the likeliest code leads from each very cell.
+
+    The arguments and errors are those of `value_table`.
+    """
+    table = value_table(task, agent, steps, seed, env)
+    assert agent.policy is not None
+    value, codes = value_and_codes(agent.policy)
+    return plot_value_map(task, value, codes, arrows=table[["dx", "dy"]].to_numpy())
+
+
+def plot_value_map(
+    task: Task,
+    value: ValueFunction,
+    codes: CodeFunction | None = None,
+    directions: NDArray[Any] | None = None,
+    resolution: int = 6,
+    arrows: NDArray[Any] | None = None,
+) -> Figure:
+    """V over the free cells, the body at rest, with the chosen code and where it leads.
+
+    Each colour covers the same area of the maze, so that the slope is seen far from the goal too, where a
+    discounted value is small; the colour bar has the values at which they change.
+
+    Args:
+        task: the maze.
+        value: observations (N, O) to V (N,); position first, then the body as it starts an episode.
+        codes: observations (N, O) to codes (N,), asked at cell centres.
+        directions: (K, 2) mean displacement of each code in metres, for the arrows.
+        resolution: points a cell on each axis.
+        arrows: (C, 2) displacement of the chosen code from each free cell, in their order, instead of `directions`.
+    """
+    figure, ax = maze_figure(task)
+    draw_walls(ax, task)
+    limits = ax.get_xlim(), ax.get_ylim()
+    half = task.cell_size / 2
+    offsets = (np.arange(resolution) + 0.5) / resolution * task.cell_size - half
+    cells = [task.cell_to_xy(cell) for cell in task.free_cells()]
+    patches = [np.stack(np.meshgrid(offsets, offsets), axis=-1) + centre for centre in cells]  # (R, R, 2) each
+    points = np.concatenate([patch.reshape(-1, 2) for patch in patches])
+    values = np.asarray(value(at_rest(task, points)), dtype=float).reshape(len(cells), resolution, resolution)
+    edges = np.unique(np.quantile(values, np.linspace(0, 1, BANDS + 1)))
+    if len(edges) < 2:  # the same everywhere
+        edges = edges[0] + np.array([-0.5, 0.5])
+    norm = BoundaryNorm(edges, 256)
+    for centre, patch in zip(cells, values, strict=True):
+        sides = (centre[0] - half, centre[0] + half, centre[1] - half, centre[1] + half)
+        image = ax.imshow(patch, extent=sides, origin="lower", cmap="viridis", norm=norm, zorder=0.5)
+    bar = figure.colorbar(image, ax=ax, shrink=0.9, spacing="uniform", ticks=edges, format="%.3g")
+    bar.set_label("V(s), discounted learning reward", fontsize=LABEL)
+    bar.ax.tick_params(labelsize=9.5)
+    if codes is not None:
+        chosen = np.asarray(codes(at_rest(task, np.stack(cells))))
+        ways = arrows if arrows is not None else None if directions is None else np.asarray(directions)[chosen]
+        for i, (centre, code) in enumerate(zip(cells, chosen, strict=True)):
+            if ways is not None and (length := float(np.linalg.norm(ways[i]))) > STAYS * task.cell_size:
+                tip = centre + ways[i] / length * 0.48 * task.cell_size
+                outline = [withStroke(linewidth=3.2, foreground="black")]  # seen on dark and on light values
+                line = {"color": "white", "lw": 1.5, "path_effects": outline}
+                arrow = {"arrowstyle": "->", "shrinkA": 0, "shrinkB": 0, **line}
+                ax.annotate("", tuple(tip), tuple(centre), arrowprops=arrow, zorder=5.5)
+            draw_number(ax, centre, int(code), size=8)
+    ax.set(xlim=limits[0], ylim=limits[1])
+    where = "from there" if arrows is not None else "on average"
+    ax.set_title(f"Value of a body at rest; likeliest skill and where it leads {where}", fontsize=LABEL)
+    return figure

@@ -1,0 +1,1 @@
+"""Numbers about skills, measured in the data and in the simulator."""

@@ -1,0 +1,190 @@
+"""Discrete against continuous skills: the same measurements, with continuous skills put into K clusters.
+
+The encodings of the data are put into K clusters by k-means; the nearest centre is a segment's code, and a cluster's
+centre is what is replayed. From there on both kinds are measured by the same functions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from datamodules.relabel import check_widths
+from datamodules.trajectories import Trajectories
+from dds_lightning.errors import UserError
+from dds_lightning.interpret.measure.recovery import code_recovery, round_trip
+from dds_lightning.interpret.measure.replay import draw_states, simulator
+from dds_lightning.tasks import Task
+
+if TYPE_CHECKING:
+    from dds_lightning.skill import SkillModule
+
+
+class ClusteredSkills:
+    """Continuous skills as K codes: the nearest of K centres, in the space of encodings.
+
+    Args:
+        skill: with a Gaussian bottleneck.
+        centres: (K, D).
+    """
+
+    def __init__(self, skill: SkillModule, centres: Tensor) -> None:
+        self.skill, self.centres = skill, centres
+        self.horizon, self.num_skills = int(skill.horizon), len(centres)
+
+    def encode(self, observations: Tensor, actions: Tensor, lengths: Tensor | None = None) -> Tensor:
+        """The nearest centre (B,) of each segment's mean encoding."""
+        found: Any = self.skill.encode_segments(observations, actions, lengths)
+        return torch.cdist(found.mean.float(), self.centres).argmin(dim=-1)
+
+    def decode(
+        self,
+        observations: Tensor,
+        codes: Tensor,
+        noise_scale: float | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Actions (B, A) under the centres of codes (B,)."""
+        return self.skill.decode_vectors(observations, self.centres[codes], noise_scale, generator)
+
+
+@torch.no_grad()
+def cluster_skills(
+    skill: SkillModule, trajectories: Trajectories, clusters: int, segments: int = 4000, seed: int = 0
+) -> ClusteredSkills:
+    """Put a continuous model's skills into clusters, by k-means on the encodings of the data.
+
+    Args:
+        skill: with a Gaussian bottleneck.
+        trajectories: the data.
+        clusters: K.
+        segments: that are encoded, drawn from all.
+        seed: of the draw and of k-means.
+
+    Raises:
+        UserError: the model's skills are discrete already, its widths are others, or the data have too few segments.
+    """
+    from scipy.cluster.vq import kmeans2
+
+    if skill.discrete:
+        raise UserError("bottleneck is vq: its skills are discrete already, only gaussian ones are put into clusters")
+    check_widths(trajectories, skill)
+    skill.eval()
+    means = []
+    for observations, actions in _segments(trajectories, skill.horizon, segments, seed, skill.device):
+        found: Any = skill.encode_segments(observations, actions)
+        means.append(found.mean.float().cpu().numpy())
+    encodings = np.concatenate(means)
+    if len(encodings) < clusters:
+        raise UserError(f"clusters is {clusters}, but the data have only {len(encodings)} segments: ask for fewer")
+    centres, _ = kmeans2(encodings, clusters, iter=30, minit="++", rng=seed)
+    return ClusteredSkills(skill, torch.as_tensor(centres, dtype=torch.float32, device=skill.device))
+
+
+def _segments(
+    trajectories: Trajectories, horizon: int, count: int, seed: int, device: torch.device
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Drawn segments of the data in batches: observations (B, H, O) and actions (B, H, A)."""
+    windows = trajectories.windows(horizon)
+    chosen = np.sort(np.random.default_rng(seed).permutation(len(windows))[:count])
+    span = np.arange(horizon)
+    for part in np.array_split(chosen, max(len(chosen) // 2048, 1)):
+        observations = trajectories.observations[windows.observation_starts[part, None] + span]
+        actions = trajectories.actions[windows.starts[part, None] + span]
+        yield torch.from_numpy(observations).to(device), torch.from_numpy(actions).to(device)
+
+
+@torch.no_grad()
+def decoding_error(
+    skill: SkillModule | ClusteredSkills, trajectories: Trajectories, segments: int = 1000, seed: int = 0
+) -> float:
+    """How far decoded actions are from those of the data, in the environment's units.
+
+    Each segment is encoded, and an action drawn in each of its states, with the model's full noise, under what was
+    found: the code of discrete skills, the centre of a continuous one's cluster, or, for a continuous model itself, the
+    segment's own vector.
+
+    Args:
+        skill: any of the three.
+        trajectories: the data; best such that the model was not trained on.
+        segments: that are decoded, drawn from all.
+        seed: of the draw and of the noise.
+
+    Returns:
+        The root mean square error of one entry of an action.
+    """
+    model = skill.skill if isinstance(skill, ClusteredSkills) else skill
+    check_widths(trajectories, model)
+    model.eval()
+    stream = torch.Generator(model.device).manual_seed(seed)
+    squares = []
+    for observations, actions in _segments(trajectories, model.horizon, segments, seed, model.device):
+        seen, horizon = observations.flatten(0, 1), model.horizon
+        if isinstance(skill, ClusteredSkills) or model.discrete:
+            held = skill.encode(observations, actions).repeat_interleave(horizon)
+            decoded = skill.decode(seen, held, 1.0, stream)
+        else:
+            found: Any = model.encode_segments(observations, actions)
+            decoded = model.decode_vectors(seen, found.mean.repeat_interleave(horizon, dim=0), 1.0, stream)
+        squares.append((decoded - actions.flatten(0, 1)).square().mean(dim=-1))
+    return float(torch.cat(squares).mean().sqrt())
+
+
+def compare_recovery(
+    task: Task,
+    trajectories: Trajectories,
+    models: Iterable[tuple[str, SkillModule]],
+    clusters: int | None = None,
+    states: int = 64,
+    seed: int = 0,
+    report: Callable[[str], None] | None = None,
+) -> pd.DataFrame:
+    """The same measurement for several models, from the same states: discrete against continuous, seed by seed.
+
+    Args:
+        task: the environment.
+        trajectories: the data that states are drawn from and continuous skills are put into clusters on.
+        models: name and model; models of one name are seeds of one kind.
+        clusters: K for continuous models; None takes that of the first discrete one.
+        states: from which every code is replayed.
+        seed: of states, noise and k-means.
+        report: told the name of each model before its turn.
+
+    Returns:
+        A row a model: `model`, `seed` (counted within its name), `kind` ("discrete" or "continuous"), the facts of
+        `recovery.Recovery`, `own_accuracy` and `own_control`, those of `recovery.round_trip`, and `decoded`, the
+        `decoding_error` under codes, with `decoded_own`, that under each segment's own vector (NaN for discrete skills,
+        which have none).
+
+    Raises:
+        UserError: continuous models alone, and no `clusters`.
+    """
+    every = list(models)
+    known = clusters or next((model.num_skills for _, model in every if model.discrete), None)
+    if known is None:
+        raise UserError("clusters is missing: among continuous models alone nothing says into how many to put them")
+    drawn = draw_states(task, trajectories, states, seed)
+    rows: list[dict[str, Any]] = []
+    with simulator(task) as env:
+        for name, model in every:
+            if report is not None:
+                report(name)
+            check_widths(trajectories, model)
+            kind = "discrete" if model.discrete else "continuous"
+            skills = model if model.discrete else cluster_skills(model, trajectories, known, seed=seed)
+            found, _ = code_recovery(task, skills, drawn, seed=seed, env=env)
+            own = round_trip(task, skills, trajectories, states, seed=seed, env=env)
+            number = sum(row["model"] == name for row in rows)
+            trip = {"own_accuracy": own.accuracy, "own_control": own.control}
+            errors = {
+                "decoded": decoding_error(skills, trajectories, seed=seed),
+                "decoded_own": math.nan if model.discrete else decoding_error(model, trajectories, seed=seed),
+            }
+            rows.append({"model": name, "seed": number, "kind": kind, **found.facts(), **trip, **errors})
+    return pd.DataFrame(rows)

@@ -1,0 +1,242 @@
+"""Does a skill mean something? Whether a code can be told from the behaviour that it produces, and how much it decides.
+
+```
+ round trip    segment of the data ─► encoder ─► k          hold k from the segment's first state, encode that: k again?
+                                                            control: hold another code there, is it taken for k?
+ recovery      any state ─► hold code k for H steps ─► encoder ─► k'        accuracy: how often k' = k
+                                  └──► displacement ──► mutual information with k
+```
+
+The round trip asks in states where the data use the code. There a state alone may give the code away (a runner's codes
+are often phases of its gait), which is what the control is for: what the code itself does, is accuracy less control.
+Recovery plays every code from the same states, so that a state says nothing, and asks more: a decoder need not follow a
+code in states where the data never use it. Chance is 1 / K in both, for codes are played equally often.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from datamodules.trajectories import Trajectories
+from dds_lightning.interpret.measure.body import root_path, to_body
+from dds_lightning.interpret.measure.information import mutual_information
+from dds_lightning.interpret.measure.replay import BodyStates, Replays, Skills, body_states, replay_codes, simulator
+from dds_lightning.tasks import Task
+
+POOL = 4000
+"""Segments of the data among which those of a round trip are drawn."""
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Recovery:
+    """How well codes are told from behaviour.
+
+    Attributes:
+        codes: (C,) the codes that were replayed.
+        confusion: (C, C) share of the replays of code i (row) that the encoder takes for code j; what it takes for a
+            code that was not replayed is missing from the row's sum.
+        accuracy: share of all replays whose code is recovered.
+        error: standard error of `accuracy`, over states.
+        chance: 1 / C.
+        information: mutual information in bits between code and displacement, over states and codes.
+        information_in_state: the same for `effects`. Where a body's speed decides where it goes in H steps, this is the
+            larger by far.
+        effects: (C, S, D) metres, what each code does to the displacement from each state: the mean over the codes from
+            the same state is taken off. An ant's is ahead of it and to its left, as it stands in that state.
+        most: bits that both can be at most, log2 C.
+        states: number of states that each code was replayed from.
+        steps: H.
+    """
+
+    codes: NDArray[np.int64]
+    confusion: Floats
+    accuracy: float
+    error: float
+    chance: float
+    information: float
+    information_in_state: float
+    most: float
+    states: int
+    steps: int
+    effects: Floats
+
+    def facts(self) -> dict[str, Any]:
+        """The numbers, for a table or for JSON."""
+        names = ("accuracy", "error", "chance", "information", "information_in_state", "most", "states", "steps")
+        return {"codes": len(self.codes), **{name: getattr(self, name) for name in names}}
+
+
+def code_recovery(
+    task: Task,
+    skills: Skills,
+    states: BodyStates,
+    codes: NDArray[Any] | None = None,
+    noise_scale: float | None = None,
+    seed: int = 0,
+    env: Any = None,
+    report: Callable[[int], None] | None = None,
+) -> tuple[Recovery, Replays]:
+    """Replay codes for H steps, encode what happened, and compare.
+
+    Args:
+        task: the environment.
+        skills: a discrete skill model, or `cluster_skills` of a continuous one.
+        states: S states, for example of `replay.draw_states`.
+        codes: (C,) those to replay, for example the codes in use; None takes all.
+        noise_scale: as in `replay.replay_codes`.
+        seed: of the decoder's noise.
+        env: from `replay.simulator`, if there is one already.
+        report: told the steps done so far.
+
+    Returns:
+        The result, and the C x S replays that it was measured on.
+    """
+    chosen = np.arange(skills.num_skills) if codes is None else np.asarray(codes, dtype=np.int64)
+    with contextlib.ExitStack() as stack:
+        env = stack.enter_context(simulator(task)) if env is None else env
+        made = replay_codes(task, skills, states, chosen, None, noise_scale, seed, env, report=report)
+        moved = displacements(root_path(task, env.unwrapped.model, made.qpos), made.lengths)
+    found = encode_replays(skills, made)
+    hits = (found == made.codes).reshape(len(chosen), len(states))
+    confusion = np.stack([(found[made.codes == k][:, None] == chosen).mean(axis=0) for k in chosen])
+    by_state = hits.mean(axis=0)  # replays from one state are alike, so states are what was drawn
+    error = float(by_state.std(ddof=1) / math.sqrt(len(states))) if len(states) > 1 else math.nan
+    by_code = moved.reshape(len(chosen), len(states), -1)
+    effects = to_body(task, by_code - by_code.mean(axis=0), states.qpos[:, 3:7])  # (C, S, D)
+    return Recovery(
+        codes=chosen,
+        confusion=confusion,
+        accuracy=float(hits.mean()),
+        error=error,
+        chance=1 / len(chosen),
+        information=mutual_information(made.codes, moved, seed=seed),
+        information_in_state=mutual_information(made.codes, effects.reshape(moved.shape), seed=seed),
+        most=math.log2(len(chosen)),
+        states=len(states),
+        steps=skills.horizon,
+        effects=effects,
+    ), made
+
+
+@dataclass(frozen=True, eq=False)
+class RoundTrip:
+    """How well codes are told from behaviour in states where the data use them.
+
+    Attributes:
+        codes: (C,) the codes that were replayed: those that enough segments of the data have.
+        confusion: (C, C) as in `Recovery`.
+        by_code: (C,) share of each code's replays in which it is found again.
+        accuracy: mean of `by_code`.
+        error: its standard error, over segments.
+        control: share of the replays of another code, from the same states, that are taken for the code of the data:
+            how far the state alone gives it away.
+        chance: 1 / C.
+        segments: of the data, for each code.
+    """
+
+    codes: NDArray[np.int64]
+    confusion: Floats
+    by_code: Floats
+    accuracy: float
+    error: float
+    control: float
+    chance: float
+    segments: int
+
+    def facts(self) -> dict[str, Any]:
+        """The numbers, for a table or for JSON."""
+        names = ("accuracy", "error", "control", "chance", "segments")
+        return {"codes": len(self.codes), **{name: getattr(self, name) for name in names}}
+
+
+def round_trip(
+    task: Task,
+    skills: Skills,
+    trajectories: Trajectories,
+    segments: int = 32,
+    noise_scale: float | None = None,
+    seed: int = 0,
+    env: Any = None,
+) -> RoundTrip:
+    """Encode segments of the data, hold the code found from each one's first state, and encode what happens then.
+
+    Args:
+        task: the environment.
+        skills: as in `code_recovery`.
+        trajectories: the data.
+        segments: for each code; a code of fewer among those that are looked at is left out, the commonest never is.
+        noise_scale: as in `replay.replay_codes`.
+        seed: of the draws and of the decoder's noise.
+        env: from `replay.simulator`, if there is one already.
+    """
+    rng = np.random.default_rng(seed)
+    windows = trajectories.windows(skills.horizon)
+    pool = np.sort(rng.permutation(len(windows))[:POOL])
+    span = np.arange(skills.horizon)
+    rows = windows.observation_starts[pool]
+    seen = trajectories.observations[rows[:, None] + span]  # (M, H, O)
+    codes = encode(skills, seen, trajectories.actions[windows.starts[pool, None] + span])
+    counts = np.bincount(codes, minlength=skills.num_skills)
+    segments = min(segments, int(counts.max()))
+    chosen = np.flatnonzero(counts >= segments)
+    drawn = np.concatenate([rng.choice(np.flatnonzero(codes == k), segments, replace=False) for k in chosen])
+    first = np.isin(rows[drawn], trajectories.observation_offsets)
+    before = np.where(first[:, None], np.nan, trajectories.observations[np.maximum(rows[drawn] - 1, 0)])
+    states = body_states(task, seen[drawn, 0], before)
+    held = codes[drawn]
+    other = chosen[(np.searchsorted(chosen, held) + rng.integers(1, max(len(chosen), 2), len(held))) % len(chosen)]
+    with contextlib.ExitStack() as stack:
+        env = stack.enter_context(simulator(task)) if env is None else env
+        found, instead = (
+            encode_replays(skills, replay_codes(task, skills, states, each, None, noise_scale, seed, env, each=True))
+            for each in (held, other)
+        )
+    confusion = np.stack([(found[held == k][:, None] == chosen).mean(axis=0) for k in chosen])
+    hits = found == held
+    by_code = np.diag(confusion).copy()
+    error = float(hits.std(ddof=1) / math.sqrt(len(hits))) if len(hits) > 1 else math.nan
+    control = float((instead == held)[other != held].mean()) if len(chosen) > 1 else math.nan
+    return RoundTrip(chosen, confusion, by_code, float(hits.mean()), error, control, 1 / len(chosen), segments)
+
+
+def encode_replays(skills: Skills, replays: Replays) -> NDArray[np.int64]:
+    """Codes (N,) that the encoder finds in replays of H steps; one that ended sooner counts as so short."""
+    lengths = np.maximum(replays.lengths, 1)
+    steps = np.minimum(np.arange(skills.horizon), lengths[:, None] - 1)  # (N, H): repeats the last step, as relabelling
+    rows = np.arange(len(steps))[:, None]
+    return encode(skills, replays.observations[rows, steps], replays.actions[rows, steps], lengths)
+
+
+@torch.inference_mode()
+def encode(
+    skills: Skills, observations: NDArray[Any], actions: NDArray[Any], lengths: NDArray[Any] | None = None
+) -> NDArray[np.int64]:
+    """Codes (N,) of segments (N, H, O), (N, H, A), of which some may be shorter than H."""
+    device = _device(skills)
+    codes = []
+    for part in np.array_split(np.arange(len(observations)), max(len(observations) // 2048, 1)):
+        seen, taken = (torch.from_numpy(values[part]).to(device) for values in (observations, actions))
+        short = lengths is not None and (lengths[part] < skills.horizon).any()
+        cut = torch.from_numpy(lengths[part]).to(device) if lengths is not None and short else None
+        codes.append(skills.encode(seen, taken, cut).cpu().numpy())
+    return np.concatenate(codes)
+
+
+def _device(skills: Skills) -> torch.device:
+    return next(skills.parameters()).device if isinstance(skills, torch.nn.Module) else torch.device("cpu")
+
+
+def displacements(paths: NDArray[Any], lengths: NDArray[Any]) -> Floats:
+    """How far (N, D) each path (N, T + 1, D) leads, to the end of its replay."""
+    ends = paths[np.arange(len(paths)), np.asarray(lengths)]
+    return np.asarray(ends - paths[:, 0], dtype=np.float64)

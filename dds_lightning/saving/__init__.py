@@ -1,0 +1,1 @@
+"""Files that survive: checkpoints, published agents, run directories."""

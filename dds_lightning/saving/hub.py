@@ -1,0 +1,95 @@
+"""Published directories on the Hugging Face hub: `hf:OWNER/NAME` wherever a directory is read or written.
+
+Only the five files of a published directory travel, and what arrives is verified like any other directory.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from dds_lightning.errors import UserError
+from dds_lightning.saving.published import CONTENTS, SUMS, load_published
+
+PREFIX = "hf:"
+
+
+def is_hub(place: str | Path) -> bool:
+    """Whether a place is on the hub."""
+    return str(place).startswith(PREFIX)
+
+
+def pull(place: str, token: str | None = None) -> Path:
+    """Fetch a published directory, or find it in the hub's own cache.
+
+    Args:
+        place: `hf:OWNER/NAME` or `hf:OWNER/NAME@REVISION`; pin a revision to get the same agent for ever.
+        token: for private repositories; None takes the one of `hf auth login`.
+
+    Returns:
+        The local directory, verified.
+
+    Raises:
+        UserError: the extra is missing, the name is none, the hub cannot be reached, or the directory is not sound.
+    """
+    repo, revision = _parse(place)
+    hub = _hub()
+    try:
+        folder = hub.snapshot_download(repo, revision=revision, token=token, allow_patterns=[*CONTENTS, SUMS])
+    except Exception as error:  # the hub's client raises its own, its HTTP library's and OSErrors
+        raise UserError(f"{place} could not be fetched: {_first_line(error)}") from error
+    load_published(folder)
+    return Path(folder)
+
+
+def push(directory: str | Path, place: str, token: str | None = None, private: bool = True) -> str:
+    """Upload a published directory; it is verified before.
+
+    Args:
+        directory: as published.
+        place: `hf:OWNER/NAME`.
+        token: None takes the one of `hf auth login`.
+        private: of a repository that does not exist yet.
+
+    Returns:
+        Address of the upload.
+
+    Raises:
+        UserError: as `pull`.
+    """
+    repo, revision = _parse(place)
+    load_published(directory)
+    hub = _hub()
+    try:
+        hub.create_repo(repo, private=private, exist_ok=True, token=token)
+        made = hub.upload_folder(
+            repo_id=repo,
+            folder_path=str(directory),
+            revision=revision,
+            token=token,
+            allow_patterns=[*CONTENTS, SUMS],
+            commit_message="Agent published by dds-lightning",
+        )
+    except Exception as error:
+        raise UserError(f"{directory} could not be pushed to {place}: {_first_line(error)}") from error
+    return str(made)
+
+
+def _parse(place: str) -> tuple[str, str | None]:
+    match = re.fullmatch(r"hf:([\w.-]+/[\w.-]+)(?:@([\w./-]+))?", str(place))
+    if match is None or ".." in place:
+        raise UserError(f"'{place}' is no place on the hub, expected hf:OWNER/NAME or hf:OWNER/NAME@REVISION")
+    return match[1], match[2]
+
+
+def _hub() -> Any:
+    try:
+        import huggingface_hub
+    except ImportError as error:
+        raise UserError("hf: needs huggingface_hub: pip install 'dds-lightning[hub]'") from error
+    return huggingface_hub
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0]

@@ -1,0 +1,246 @@
+"""A run directory that knows what is done: stages with markers, skipped, resumed or redone.
+
+```
+ runs/TASK/
+   run.lock              held while a `dds run` works here
+   STAGE/…               what the stage wrote
+   STAGE/stage.json      state, settings, fingerprint of its inputs and outputs, seconds
+   previous/STAGE/…      the last result that other settings replaced
+```
+
+A stage is *done* when its marker says so, its settings and the outputs of the stages it reads from are the
+same as now, and its own outputs are still there. It is *resumed* when it was started with exactly these
+settings and inputs and not finished. In every other case what lies there moves to `previous/` and it starts
+anew.
+"""
+
+import fcntl
+import hashlib
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from dds_lightning.errors import UserError
+from dds_lightning.saving.files import refuse_newer, sha256, written_whole
+
+FORMAT = 1
+MARKER = "stage.json"
+Work = Callable[[Path, bool], Mapping[str, Any]]
+
+
+@dataclass
+class Done:
+    """A finished stage.
+
+    Attributes:
+        name: of the stage.
+        folder: where its files are.
+        outputs: name -> path of what the next stages read.
+        facts: small results worth keeping in the marker; the same for the same outputs.
+        digest: of outputs and facts; the next stages' markers hold it.
+        seconds: that the work took, interruptions left out.
+        skipped: whether it had been done before.
+    """
+
+    name: str
+    folder: Path
+    outputs: dict[str, Path]
+    facts: dict[str, Any] = field(default_factory=dict)
+    digest: str = ""
+    seconds: float = 0.0
+    skipped: bool = False
+
+
+class Stages:
+    """The stages of one run directory.
+
+    Args:
+        root: the run directory.
+        console: where progress is told.
+        fresh: take nothing for done.
+    """
+
+    def __init__(self, root: Path, console: Console, fresh: bool = False) -> None:
+        self.root, self.console, self.fresh = root, console, fresh
+        self.done: list[Done] = []
+
+    def do(self, name: str, title: str, settings: Mapping[str, Any], reads: list[Done], work: Work) -> Done:
+        """Do one stage, or find it done.
+
+        Args:
+            name: of the stage and its folder.
+            title: what a person reads while it runs.
+            settings: everything that its result depends on, apart from `reads`; JSON values.
+            reads: the stages whose outputs it uses.
+            work: called with (folder, resuming); returns outputs (values that are paths in the folder) and
+                facts.
+
+        Raises:
+            UserError: a newer version of this package did the stage; nothing is touched.
+        """
+        folder = self.root / name
+        expected = {"settings": _json(settings), "inputs": {stage.name: stage.digest for stage in reads}}
+        marker = read_marker(folder)
+        same = {key: marker.get(key) for key in expected} == expected
+        if same and marker.get("state") == "finished" and not self.fresh and (found := _found(folder, marker)):
+            self._say(f"{title}: done before, in {duration(found.seconds)}", "dim")
+            self.done.append(found)
+            return found
+
+        resuming = same and marker.get("state") == "started" and not self.fresh
+        if resuming:
+            self._say(f"{title}: going on after {duration(marker.get('seconds', 0.0))}", "bold")
+        else:
+            reason = "" if not marker or self.fresh else f" again ({_difference(marker, expected)})"
+            self._say(f"{title}{reason}", "bold")
+            _put_away(folder, self.root / "previous" / name)
+        folder.mkdir(parents=True, exist_ok=True)
+        before = float(marker.get("seconds", 0.0)) if resuming else 0.0
+        record = {"format": FORMAT, "stage": name, "state": "started", **expected, "seconds": before}
+        write_json(folder / MARKER, record)
+        started = time.monotonic()
+        try:
+            made = dict(work(folder, resuming))
+        except BaseException:
+            write_json(folder / MARKER, {**record, "seconds": before + time.monotonic() - started})
+            raise
+        outputs = {key: value for key, value in made.items() if isinstance(value, Path)}
+        facts = _json({key: value for key, value in made.items() if key not in outputs})
+        seconds = before + time.monotonic() - started
+        files = {key: _digest(path) for key, path in outputs.items()}
+        record |= {
+            "state": "finished",
+            "seconds": round(seconds, 2),
+            "finished": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+            "outputs": {key: os.path.relpath(path, folder) for key, path in outputs.items()},
+            "files": files,
+            "facts": facts,
+        }
+        write_json(folder / MARKER, record)
+        result = Done(name, folder, outputs, facts, _join(files, facts), seconds)
+        self._say(f"{title}: {duration(seconds)}", "green")
+        self.done.append(result)
+        return result
+
+    def _say(self, text: str, style: str) -> None:
+        self.console.print(f"[{style}]{text}[/]", highlight=False)
+
+
+@contextmanager
+def locked(root: Path) -> Iterator[None]:
+    """Keep a second `dds run` out of the directory while this one works.
+
+    Raises:
+        UserError: somebody else is working there, or it is no folder.
+    """
+    if root.exists() and not root.is_dir():
+        raise UserError(f"out: {root} is a file, expected a folder for the run")
+    created = not root.exists()
+    root.mkdir(parents=True, exist_ok=True)
+    path = root / "run.lock"
+    try:
+        with path.open("w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise UserError(
+                    f"out: another `dds run` is working in {root}: wait for it, or choose another --out"
+                ) from None
+            yield
+    finally:
+        # A run that ended before its first stage leaves nothing behind.
+        if created and [entry.name for entry in root.iterdir()] == [path.name]:
+            shutil.rmtree(root)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON so that a reader sees the old file or the new one, and never half of one."""
+    text = json.dumps(value, indent=2, allow_nan=False)
+    with written_whole(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def duration(seconds: float) -> str:
+    """`83` as `1 min 23 s`."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min {rest} s" if minutes else f"{rest} s" if seconds >= 10 else f"{seconds:.1f} s"
+
+
+def read_marker(folder: Path) -> dict[str, Any]:
+    """The marker of a stage's folder; empty where there is none, or a damaged one.
+
+    Raises:
+        UserError: a newer version of this package wrote it.
+    """
+    try:
+        value = json.loads((folder / MARKER).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    if not isinstance(value, dict):
+        return {}
+    refuse_newer(folder / MARKER, value.get("format", FORMAT), FORMAT)
+    return value
+
+
+def _found(folder: Path, marker: dict[str, Any]) -> Done | None:
+    """The stage as it was finished, if its outputs are all as they were."""
+    outputs = {key: folder / relative for key, relative in marker["outputs"].items()}
+    if any(not path.exists() or _digest(path) != marker["files"][key] for key, path in outputs.items()):
+        return None
+    digest, seconds = _join(marker["files"], marker["facts"]), float(marker["seconds"])
+    return Done(marker["stage"], folder, outputs, marker["facts"], digest, seconds, skipped=True)
+
+
+def _digest(path: Path) -> str:
+    """SHA-256 of a file, or of every file under a folder with its name."""
+    if path.is_file():
+        return sha256(path)
+    files = sorted(entry for entry in path.rglob("*") if entry.is_file())
+    return _join({str(entry.relative_to(path)): sha256(entry) for entry in files}, {})
+
+
+def _join(files: Mapping[str, str], facts: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps([files, facts], sort_keys=True).encode()).hexdigest()
+
+
+def _json(value: Any) -> Any:
+    return json.loads(json.dumps(value, default=str))
+
+
+def _put_away(folder: Path, previous: Path) -> None:
+    if not folder.exists():
+        return
+    if previous.exists():
+        shutil.rmtree(previous)
+    previous.parent.mkdir(parents=True, exist_ok=True)
+    os.replace(folder, previous)
+
+
+def _difference(marker: dict[str, Any], expected: dict[str, Any]) -> str:
+    """In a few words, why a stage is done again."""
+    old, new = _flat(marker.get("settings") or {}), _flat(expected["settings"])
+    changed = [name for name in {**old, **new} if old.get(name) != new.get(name)]
+    if changed:
+        shown = ", ".join(f"{name} {old.get(name)!r} -> {new.get(name)!r}" for name in changed[:3])
+        return shown + (f" and {len(changed) - 3} more" if len(changed) > 3 else "")
+    inputs = marker.get("inputs") or {}
+    stale = [name for name, digest in expected["inputs"].items() if inputs.get(name) != digest]
+    return f"{', '.join(stale)} changed" if stale else "its files changed"
+
+
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in settings.items():
+        flat.update(_flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value})
+    return flat

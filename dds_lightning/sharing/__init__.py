@@ -1,0 +1,1 @@
+"""An agent for others: exported to one file, verified."""

@@ -1,0 +1,104 @@
+"""Is a published directory what it says it is? Everything that `dds checkpoints verify` looks at."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from dds_lightning.agent import DDSAgent
+from dds_lightning.errors import UserError
+from dds_lightning.saving.published import SUMS, load_published
+
+TOLERANCE = 1e-3
+"""Between the answers stored and given: processors and library versions round differently, weights that differ do
+more."""
+
+
+def verify_published(directory: str | Path) -> dict[str, Any]:
+    """Look at everything: file hashes, header, shapes, finite numbers, and the answers to fixed questions.
+
+    Args:
+        directory: as published.
+
+    Returns:
+        Facts: `task`, `parameters`, `horizon`, `num_skills`, `golden` (largest difference from the stored answers;
+        None for a directory that stores none).
+
+    Raises:
+        UserError: at the first thing wrong; the message names the file.
+    """
+    published = load_published(directory)
+    agent = DDSAgent.load(directory)
+    facts: dict[str, Any] = {
+        "directory": str(directory),
+        "task": published.config.get("task"),
+        "format": published.config["format_version"],
+        "parameters": sum(parameter.numel() for parameter in agent.parameters()),
+        "horizon": agent.horizon,
+        "num_skills": agent.num_skills,
+        "golden": None,
+    }
+    stored = published.config.get("golden")
+    if stored is not None:
+        facts["golden"] = _compare(directory, stored, agent.golden())
+    return facts
+
+
+def _compare(directory: str | Path, stored: Any, given: dict[str, Any]) -> float:
+    largest = 0.0
+    for name, answer in given.items():
+        try:
+            expected = np.array(stored[name], dtype=np.float64)
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(f"{directory}: golden, {name}: found no table of numbers ({error!r})") from error
+        if expected.shape != np.shape(answer):
+            raise UserError(
+                f"{directory}: golden, {name}: found shape {expected.shape}, expected {np.shape(answer)}; the "
+                "directory's files are not of one agent"
+            )
+        difference = float(np.abs(expected - np.array(answer)).max())
+        if not difference <= TOLERANCE:
+            raise UserError(
+                f"{directory}: golden, {name}: this installation answers {difference:.2g} apart from what the agent "
+                f"answered when it was published, expected at most {TOLERANCE:g}; its weights were changed, or the "
+                "networks of this version compute something else"
+            )
+        largest = max(largest, difference)
+    return largest
+
+
+def find_published(roots: Iterable[str | Path] = ("checkpoints", "runs")) -> pd.DataFrame:
+    """Published directories under some folders, without reading their weights.
+
+    Returns:
+        One row a directory: `checkpoint`, `task`, `score` (of the first contestant in metrics.json), `success`,
+        `seed`, `megabytes`, `problem` (empty when hashes and header are sound).
+    """
+    rows = []
+    for root in roots:
+        for sums in sorted(Path(root).rglob(SUMS)):
+            if (sums.parent / "model.safetensors").is_file() and not sums.parent.name.startswith("."):
+                rows.append(_row(sums.parent))
+    return pd.DataFrame(rows, columns=["checkpoint", "task", "score", "success", "seed", "megabytes", "problem"])
+
+
+def _row(directory: Path) -> dict[str, Any]:
+    size = sum(path.stat().st_size for path in directory.iterdir() if path.is_file()) / 1e6
+    row: dict[str, Any] = {"checkpoint": str(directory), "megabytes": round(size, 1), "problem": ""}
+    try:
+        published = load_published(directory)
+    except UserError as error:
+        return {**row, "problem": str(error)}
+    results = published.metrics.get("results")
+    first = results[0] if isinstance(results, list) and results and isinstance(results[0], dict) else {}
+    return {
+        **row,
+        "task": published.config.get("task"),
+        "score": first.get("score"),
+        "success": first.get("success"),
+        "seed": published.metrics.get("seed"),
+    }

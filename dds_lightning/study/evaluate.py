@@ -1,0 +1,102 @@
+"""`dds evaluate`: play a published agent, or a run's last and best checkpoint, and tell how."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from dds_lightning.agent import DDSAgent
+from dds_lightning.console.reports import Report, table
+from dds_lightning.errors import UserError
+from dds_lightning.rollout.actors import Contestant
+from dds_lightning.rollout.play import rollout
+from dds_lightning.saving.published import load_published
+from dds_lightning.study.contestants import agent_directory, best_directory, way
+from dds_lightning.study.protocol import BEST, LAST, heading, paper_line, protocol
+from dds_lightning.tasks import Task, get_task
+
+
+def evaluate(
+    directory: Path,
+    *,
+    task: str | None = None,
+    episodes: int | None = None,
+    selection: Sequence[str] = ("greedy", "sample"),
+    temperature: float = 1.0,
+    noise_scale: float | None = None,
+    checkpoint: Literal["last", "best", "both"] = "both",
+    seed: int = 0,
+    workers: int | None = None,
+    out: str | None = None,
+) -> Report:
+    """Roll out a trained agent; arguments and JSON keys are those of `dds evaluate`.
+
+    Raises:
+        UserError: no agent there, or none of the wanted checkpoint, of the task or with a way of choosing.
+    """
+    places = _places(directory, checkpoint)
+    first = next(iter(places.values()))
+    name = task or load_published(first).config.get("task")
+    if name is None:
+        raise UserError(f"{first} does not say which task it is for: give --task")
+    wanted = get_task(name)
+    count = wanted.evaluation_episodes if episodes is None else episodes
+    if count < 1:
+        raise UserError(f"--episodes is {count}, expected at least 1")
+    players: list[Contestant] = []
+    shown: dict[str, str] = {}
+    facts: dict[str, Any] | None = None
+    for kind, place in places.items():
+        agent = _agent(place, wanted, seed, noise_scale)
+        if kind == BEST:
+            facts = load_published(place).config["checkpoint"]
+        for choice in dict.fromkeys(selection):
+            heat = temperature if choice == "sample" else 1.0
+            players.append(way(agent, choice, count, heat, facts if kind == BEST else None))
+            shown[players[-1].name] = kind
+    kinds = " and ".join(places)
+    how = protocol(wanted, agent, episodes=count, seed=seed, temperature=temperature, checkpoint=kinds, best=facts)
+    result = rollout(wanted, players, seed=seed, workers=workers)
+    summary = result.summary()
+    summary.insert(1, "checkpoint", summary["actor"].map(shown))
+    data: dict[str, Any] = {"agent": places.get(LAST), "best": places.get(BEST), "task": name, "seed": seed}
+    hidden = ["checkpoint", *([] if wanted.measures_success else ["success", "length_success"])]
+    lines: list[Any] = [heading(how), table(summary.drop(columns=hidden))]
+    lines += [line] if (line := paper_line(wanted)) else []
+    report = Report({**data, "protocol": how, "results": summary}, lines)
+    if out is not None:
+        Path(out).parent.mkdir(parents=True, exist_ok=True)
+        result.episodes.to_parquet(out, index=False)
+        report.data["episodes"] = out
+        report.text.append(out)
+    return report
+
+
+def _places(directory: Path, checkpoint: str) -> dict[str, Path]:
+    """The published directories to play, by checkpoint."""
+    last: Path | None = agent_directory(directory)
+    best = best_directory(directory)
+    if last == directory and isinstance(load_published(directory).config.get("checkpoint"), dict):
+        last, best = None, directory  # what a run published as its best
+    found = {kind: place for kind, place in ((LAST, last), (BEST, best)) if place is not None}
+    if checkpoint == "both":
+        return found
+    if checkpoint not in found:
+        raise UserError(
+            f"--checkpoint is {checkpoint}, but {directory} holds only the {' and '.join(found)} one (`dds run "
+            "--evaluate_every STEPS` keeps the best beside the last)"
+        )
+    return {checkpoint: found[checkpoint]}
+
+
+def _agent(path: Path, task: Task, seed: int, noise_scale: float | None) -> DDSAgent:
+    chosen = {} if noise_scale is None else {"noise_scale": noise_scale}
+    agent = DDSAgent.load(path, seed=seed, **chosen)
+    found, expected = (agent.observation_dim, agent.action_dim), (task.observation_dim, task.action_dim)
+    if found != expected:
+        raise UserError(
+            f"the agent in {path} has (observation_dim, action_dim) {found}, task {task.name} has {expected}: it was "
+            "trained for another task"
+        )
+    return agent

@@ -1,0 +1,168 @@
+"""`dds atlas`: what a place holds (a run, a published agent, a skill checkpoint), and the skill atlas of it."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from dds_lightning.agent import DDSAgent
+from dds_lightning.errors import UserError
+from dds_lightning.interpret.atlas.build import CONTINUOUS, DISCRETE, Atlas, make_atlas
+from dds_lightning.interpret.atlas.page import write_atlas, write_pictures
+from dds_lightning.interpret.atlas.pictures import Tell
+from dds_lightning.rollout.actors import single_skills
+from dds_lightning.rollout.play import rollout
+from dds_lightning.rollout.result import RolloutResult
+from dds_lightning.saving.files import neighbours
+from dds_lightning.saving.run_directory import read_marker
+from dds_lightning.skill import SkillModule
+from dds_lightning.study.contestants import agent_directory, way
+from dds_lightning.study.findings import Findings
+from dds_lightning.tasks import Task, get_task
+
+SINGLE = "single skill"
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """What an atlas is about.
+
+    Attributes:
+        agent: its skills, and its policy if there is one.
+        task: name of the task; None where nothing says it.
+        data: where the data are, `SOURCE:NAME`; None where nothing says it.
+        found: the evaluation of a finished run; None elsewhere.
+        about: what it is, in words.
+    """
+
+    agent: DDSAgent
+    task: str | None
+    data: str | None
+    found: Findings | None
+    about: str
+
+
+def find_subject(place: Path, seed: int = 0) -> Subject:
+    """Look at a place.
+
+    Args:
+        place: a run of `dds run` that has learnt its skills at least, a published directory, or a skill checkpoint.
+        seed: of the agent.
+
+    Raises:
+        UserError: it is none of these.
+    """
+    if place.is_file() or place.suffix == ".ckpt":
+        return Subject(_skills_alone(place, seed), None, None, None, f"skill checkpoint {place}")
+    data, task = _data_of(place)
+    if not (place / "model.safetensors").is_file() and not (place / "agent" / "model.safetensors").is_file():
+        checkpoint = place / "skill" / "last.ckpt"
+        if read_marker(place / "skill").get("state") == "finished" and checkpoint.is_file():
+            return Subject(
+                _skills_alone(checkpoint, seed), task, data, None, f"skills of the run {place}, no policy yet"
+            )
+        if data is not None:
+            raise UserError(f"{place} is a run that has not learnt its skills yet: let `dds run` finish them")
+    directory = agent_directory(place)
+    from dds_lightning.saving.published import load_published
+
+    task = load_published(directory).config.get("task") or task
+    found = Findings.read(place) if (place / "evaluate" / "episodes.parquet").is_file() else None
+    return Subject(DDSAgent.load(directory, seed=seed), task, data, found, f"published agent {directory}")
+
+
+def _skills_alone(checkpoint: Path, seed: int) -> DDSAgent:
+    if not checkpoint.is_file():
+        raise UserError(f"there is no checkpoint {checkpoint}{neighbours(checkpoint)}")
+    return DDSAgent(SkillModule.load(checkpoint), None, "random", seed=seed)
+
+
+def _data_of(run: Path) -> tuple[str | None, str | None]:
+    """Data and task of a run; nothing of what is no run."""
+    marker = read_marker(run / "data")
+    settings = marker.get("settings", {})
+    collected = marker.get("outputs", {}).get("data")
+    return settings.get("data") or (f"local:{run / 'data' / collected}" if collected else None), settings.get("task")
+
+
+def atlas(
+    place: Path,
+    data: str | None,
+    task: str | None,
+    out: Path,
+    episodes: int = 5,
+    against: Sequence[Path] = (),
+    seed: int = 0,
+    figures: Path | None = None,
+    tell: Tell = lambda words: None,
+) -> tuple[Atlas, Path]:
+    """Make and write the atlas of a place; the arguments are those of `dds atlas`.
+
+    Raises:
+        UserError: no skills there, no data or no task known, or they do not fit each other.
+        DataError: data that are damaged or another task's.
+    """
+    from datamodules.relabel import check_widths
+    from datamodules.sources import load_trajectories, resolve_task
+
+    tell("looking at the checkpoint")
+    subject = find_subject(place, seed)
+    spec, name = data or subject.data, task or subject.task
+    if spec is None:
+        raise UserError(f"{place} does not know its data: give --data, for example local:DIR, minari:ID or d4rl:FILE")
+    if name is None:
+        raise UserError(f"{place} does not say which task it is for: give --task; `dds tasks` lists them")
+    wanted = resolve_task(spec, get_task(name))
+    models = [SkillModule.load(path) for path in against]
+    tell("reading the data")
+    trajectories = load_trajectories(spec, wanted)
+    for model in (subject.agent.skill, *models):
+        check_widths(trajectories, model)
+    result, main, singles = _episodes(subject, wanted, episodes, seed, tell)
+    others = [(DISCRETE if model.discrete else CONTINUOUS, model) for model in models]
+    made = make_atlas(subject.agent, wanted, trajectories, result, main, singles, others=others, seed=seed, tell=tell)
+    words = ["dds", "atlas", str(place), "--data", spec, "--task", wanted.name, "--seed", str(seed)]
+    tell("writing the page")
+    if figures is not None:
+        write_pictures(made, figures, out.stem)
+    about = _about(subject, wanted, spec, result, main)
+    return made, write_atlas(made, out, about, shlex.join([*words, "--out", str(out)]))
+
+
+def _episodes(
+    subject: Subject, task: Task, episodes: int, seed: int, tell: Tell
+) -> tuple[RolloutResult | None, str | None, str | None]:
+    """Episodes with their paths, the policy's name and the single skills': a run's own, or played now."""
+    found = subject.found
+    if found is not None and found.task == task and found.result.paths:
+        return found.result, found.main, found.singles
+    if episodes == 0:
+        return None, None, None
+    agent = subject.agent
+    players, main = [single_skills(agent, episodes, SINGLE)], None
+    if agent.policy is not None:
+        players.insert(0, way(agent, agent.selection, max(episodes, 1), agent.temperature))
+        main = players[0].name
+    tell(f"playing {sum(player.episodes for player in players)} episodes")
+    seen = task.maze_map is None  # where there is no way over a maze to draw
+    result = rollout(task, players, seed=seed, progress=False, record=True, record_observations=seen)
+    return result, main, SINGLE
+
+
+def _about(
+    subject: Subject, task: Task, spec: str, result: RolloutResult | None, main: str | None
+) -> list[tuple[str, str]]:
+    settings = subject.agent.skill.hparams
+    lines = [
+        ("checkpoint", subject.about),
+        ("data", spec),
+        ("task", f"{task.name} ({task.env_id})"),
+        ("skills", f"K = {settings['num_skills']}, D = {settings['skill_dim']}, H = {settings['horizon']}"),
+    ]
+    if result is not None and main is not None:
+        row = result.summary().set_index("actor").loc[main]
+        reached = f"{row['success']:.0f} % succeed" if task.measures_success else f"score {row['score']:.1f}"
+        lines.append(("policy", f"{main}: {reached}, {row['episodes']:.0f} episodes"))
+    return lines
