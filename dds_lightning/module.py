@@ -5,11 +5,12 @@ import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar, Literal, Self
 
 import lightning.pytorch as pl
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from dds_lightning.errors import UserError
 from dds_lightning.finetune import read, start_from
@@ -37,6 +38,7 @@ class StageModule(pl.LightningModule):
 
     normaliser: Normaliser
     init_from: str | None = None  # the checkpoint this module started from, in this process
+    terms: Mapping[str, Tensor] = MappingProxyType({})  # of the last training step; `FiniteGuard` names the bad ones
 
     def _refuse(self, rules: Sequence[tuple[str, bool, str]]) -> None:
         """Refuse settings: (name, whether it is fine, what is expected)."""
@@ -109,6 +111,39 @@ class StageModule(pl.LightningModule):
                 f"model.trainable is {self.hparams.trainable}, but the rest has only random weights: give "
                 "--model.init_from=CHECKPOINT, or train all of it"
             )
+
+    def data_statistics(self, names: Sequence[str], remedy: str) -> dict[str, Any]:
+        """Statistics of the training data, as the data module computes them.
+
+        Args:
+            names: Those that are needed; others are left out.
+            remedy: What to do where there are none, for the message.
+
+        Returns:
+            Name to value.
+
+        Raises:
+            UserError: The data module has no statistics, or lacks one of them.
+        """
+        datamodule: Any = getattr(self.trainer, "datamodule", None)
+        if not hasattr(datamodule, "statistics"):
+            raise UserError(f"the {self.STAGE} model has no observation statistics: {remedy} first")
+        statistics = datamodule.statistics()
+        if missing := [name for name in names if name not in statistics]:
+            raise UserError(f"{type(datamodule).__name__}.statistics() lacks {', '.join(missing)}: return these too")
+        return {name: statistics[name] for name in names}
+
+    def evaluate(self, batch: dict[str, Tensor], stage: str) -> None:
+        """Log how the model does on a held-out batch; `stage` is the prefix of the names, ``val`` or ``test``."""
+        raise NotImplementedError
+
+    def validation_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
+        """Log how the model does on a held-out batch."""
+        self.evaluate(batch, "val")
+
+    def test_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
+        """As `validation_step`."""
+        self.evaluate(batch, "test")
 
     def configure_optimizers(self) -> Any:
         """Adam over everything that learns together, with a learning rate for each part where `lr_scale` says so."""
