@@ -3,7 +3,7 @@
 import hashlib
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal, Self
@@ -40,14 +40,21 @@ class StageModule(pl.LightningModule):
     init_from: str | None = None  # the checkpoint this module started from, in this process
     terms: Mapping[str, Tensor] = MappingProxyType({})  # of the last training step; `FiniteGuard` names the bad ones
 
-    def _refuse(self, rules: Sequence[tuple[str, bool, str]]) -> None:
-        """Refuse settings: (name, whether it is fine, what is expected)."""
+    def check(self, *rules: tuple[str, bool, str]) -> None:
+        """Refuse settings outside their range, those that all stages share included.
+
+        Args:
+            *rules: Name of a setting, whether its value is allowed, and what is expected.
+
+        Raises:
+            UserError: Names the first setting that is not allowed.
+        """
         h = self.hparams
-        allowed = ", ".join(self.PARTS)
         named = [h.trainable] if isinstance(h.trainable, str) else list(h.trainable)
         parts = bool(named) and (named == ["all"] or set(named) <= set(self.PARTS))
-        scales = h.lr_scale or {}
+        scales, allowed = h.lr_scale or {}, ", ".join(self.PARTS)
         common = [
+            ("lr", h.lr > 0, "positive"),
             ("trainable", parts, f"all or some of {allowed}"),
             ("lr_scale", set(scales) <= set(self.PARTS), f"factors for some of {allowed}"),
             ("lr_scale", all(x > 0 for x in scales.values()), "positive factors: freeze parts with trainable"),
@@ -55,8 +62,8 @@ class StageModule(pl.LightningModule):
         if parts:
             left = ", ".join(self.trained_parts)
             common.append(("lr_scale", set(scales) <= set(self.trained_parts), f"factors for what is trained: {left}"))
-        for name, fine, expected in [*rules, *common]:
-            if not fine:
+        for name, allows, expected in [*rules, *common]:
+            if not allows:
                 raise UserError(f"model.{name} is {h[name]}, expected {expected}")
 
     @property
@@ -132,6 +139,19 @@ class StageModule(pl.LightningModule):
         if missing := [name for name in names if name not in statistics]:
             raise UserError(f"{type(datamodule).__name__}.statistics() lacks {', '.join(missing)}: return these too")
         return {name: statistics[name] for name in names}
+
+    def log_training(self, total: Tensor, more: Callable[[], Mapping[str, Tensor]] = dict) -> None:
+        """Log a training step's loss and terms every ``log_every_n_steps`` steps.
+
+        Logging each step of a small network would cost as much as the step.
+
+        Args:
+            total: The loss.
+            more: Computes what else to log; not called at other steps.
+        """
+        if self.global_step % max(getattr(self.trainer, "log_every_n_steps", 50), 1) == 0:
+            log = {"loss": total.detach(), **self.terms, **more()}
+            self.log_dict({f"train/{name}": value for name, value in log.items()})
 
     def evaluate(self, batch: dict[str, Tensor], stage: str) -> None:
         """Log how the model does on a held-out batch; `stage` is the prefix of the names, ``val`` or ``test``."""
@@ -222,9 +242,3 @@ def adam(
 
     scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
     return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
-
-
-def is_log_step(module: pl.LightningModule) -> bool:
-    """Whether this step is logged: `log_dict` at every step of a small network costs as much as the step."""
-    every = getattr(module.trainer, "log_every_n_steps", 50)
-    return module.global_step % max(every, 1) == 0

@@ -6,9 +6,8 @@
                                   pi(k | s) ◄─ exp(alpha (Q - V)) log pi(k | s)   equation 9
 ```
 
-One Adam minimises the sum of the losses: their parameters are disjoint and every target carries a stop-gradient, so
-the step equals that of three optimisers stepping at once. (The original IQL updates V, then the policy, then Q, each
-using the networks just updated.)
+One Adam minimises the sum of the losses: parameters are disjoint and targets carry a stop-gradient, so its step equals
+those of three optimisers. (The original IQL updates V, the policy and Q in turn, each with the networks just updated.)
 
 With so few codes, the policy that minimises equation 9 can also be written down, with beta the policy of the data:
 
@@ -28,14 +27,13 @@ import torch
 from torch import Tensor, nn
 
 import dds_lightning.losses as losses
-from dds_lightning.module import StageModule, is_log_step
+from dds_lightning.module import StageModule
 from dds_lightning.nn.mlp import MLP, FourierFeatures
 from dds_lightning.nn.normaliser import Normaliser
 
 Selection = Literal["sample", "greedy", "argmax_q"]
 Solution = Literal["regression", "closed_form"]
-Loss = tuple[Tensor, dict[str, Tensor]]
-"""A scalar to minimise, and statistics to log beside it."""
+Loss = tuple[Tensor, dict[str, Tensor]]  # a scalar to minimise, and statistics to log beside it
 STATISTICS = ("observation_mean", "observation_std", "code_share", "reward_range", "max_discount")
 """What a data module's `statistics()` must provide: the arguments of `fit_statistics`."""
 
@@ -59,43 +57,43 @@ class PolicyModule(StageModule):
     Args:
         observation_dim: O, linked from the data on the command line.
         num_skills: K, linked from the data.
-        hidden_dims: widths of value, Q and policy networks.
-        layer_norm: normalise before each ReLU of value and Q networks.
-        fourier_features: frequencies given to value, Q and policy networks beside the observation; 0 for none. They
+        hidden_dims: Widths of value, Q and policy networks.
+        layer_norm: Normalise before each ReLU of value and Q networks.
+        fourier_features: Frequencies that value, Q and policy networks see beside the observation; 0 for none. They
             let a small network see a thin wall early (named departure from the paper).
-        fourier_scale: standard deviation of those frequencies.
-        fourier_seen: how many leading numbers of the observation they see; 0 for all. 2 on a robot with many joints
-            whose position comes first, lest a moving leg hide where it is.
-        tau: expectile of the value loss.
-        alpha: temperature of AWR; larger follows the critic more closely. One preset with the rewards' scale.
-        weight_clip: upper bound of the AWR weights; ``closed_form`` has no uneven weights and needs none.
+        fourier_scale: Standard deviation of those frequencies.
+        fourier_seen: How many leading numbers of the observation they see, for example 2 for a position that comes
+            before many joints: a moving leg must not hide where the robot is. 0 for all.
+        tau: Expectile of the value loss.
+        alpha: Temperature of AWR; larger follows the critic more closely. Choose it together with the reward scale.
+        weight_clip: Upper bound of the AWR weights; not used by ``closed_form``, whose weights are equal.
         awr: ``regression`` on the codes of the data (the paper), or ``closed_form``, the policy that the regression
-            would find with data without end (named departure from the paper). `alpha` then may change at any time.
-        beta_floor: with ``closed_form``, codes to which the policy of the data gives less than this in a state are
+            would find with infinite data (named departure from the paper); `alpha` may then change at any time.
+        beta_floor: With ``closed_form``, codes to which the policy of the data gives less than this in a state are
             not chosen there: their Q was hardly learnt.
-        target_ema: rate of the target network.
+        target_ema: Rate of the target network.
         extraction: ``after`` trains the critic for ``critic_steps``, then the policy on the frozen critic (the
             paper); ``joint`` trains them together.
-        critic_steps: steps of the critic with ``after``; the remaining steps up to ``max_steps`` go to the policy.
-        support: codes seen less often than this share of the data are never chosen.
+        critic_steps: Steps of the critic with ``after``; the remaining steps up to ``max_steps`` go to the policy.
+        support: Codes seen less often than this share of the data are never chosen.
         lr: Adam's learning rate.
         lr_schedule: ``constant`` (the paper) or ``cosine`` decay to zero at ``max_steps``.
-        warmup_steps: steps of linear warm-up.
+        warmup_steps: Steps of linear warm-up.
         init_from: ``.ckpt`` or published directory whose weights to start from (`dds_lightning.finetune`), for new
-            rewards or a new goal; ``data.skill`` must be the skill model that this policy learnt with.
+            rewards or a new goal; ``data.skill`` must be the skill model that this policy was trained with.
         trainable: ``all``, ``critic`` (V and Q) or ``actor``; the rest does not change by a bit.
-        lr_scale: factor on ``lr`` by part, such as ``{actor: 0.1}``; 1 for a part that is not named.
-        refit_normaliser: with ``init_from``, take the statistics of the new data, not the checkpoint's.
-        watch: look every so many steps whether the critic left the range that rewards and discounts allow.
-        skill_hash: fingerprint of the skill model whose codes these are, linked from the data; null if nobody knows.
+        lr_scale: Factor on ``lr`` by part, such as ``{actor: 0.1}``; 1 for a part that is not named.
+        refit_normaliser: With ``init_from``, take the statistics of the new data, not the checkpoint's.
+        watch: Steps between two checks whether the critic left the range that rewards and discounts allow.
+        skill_hash: Fingerprint of the skill model whose codes these are, linked from the data; null if unknown.
 
     Raises:
-        UserError: a setting outside its range; the message names it.
+        UserError: A setting is outside its range; the message names it.
     """
 
     STAGE = "policy"
     PARTS: ClassVar = {"critic": ("value", "critic", "target_critic"), "actor": ("actor",)}
-    # What `awr` is belongs to the weights: with `closed_form` the actor's are those of beta.
+    # `awr` belongs to the weights: with `closed_form` the actor is beta.
     SHAPE = ("num_skills", "hidden_dims", "layer_norm", "fourier_features", "fourier_scale", "fourier_seen", "awr")
     OF_DATA = ("support_mask", "value_range")
     support_mask: Tensor
@@ -132,7 +130,17 @@ class PolicyModule(StageModule):
         super().__init__()
         hidden_dims = list(hidden_dims)
         self.save_hyperparameters(ignore=["init_from"])
-        self._check_settings()
+        self.check(
+            ("num_skills", num_skills >= 2, "at least 2: with one code there is nothing to choose"),
+            ("fourier_seen", 0 <= fourier_seen <= observation_dim, f"in [0, {observation_dim}]"),
+            ("tau", 0 < tau < 1, "in (0, 1)"),
+            ("alpha", alpha >= 0, "0 or more"),
+            ("weight_clip", weight_clip > 0, "positive"),
+            ("awr", awr in get_args(Solution), " or ".join(get_args(Solution))),
+            ("beta_floor", 0 <= beta_floor < 1 / num_skills, f"in [0, 1/{num_skills})"),
+            ("target_ema", 0 < target_ema <= 1, "in (0, 1]"),
+            ("support", 0 <= support < 1 / num_skills, f"in [0, 1/{num_skills})"),
+        )
         self.num_skills = num_skills
         self.normaliser = Normaliser(observation_dim)
         self.features: nn.Module = nn.Identity()
@@ -146,28 +154,10 @@ class PolicyModule(StageModule):
         self.target_critic.load_state_dict(self.critic.state_dict())
         self.target_critic.requires_grad_(False)
         self.actor = MLP(width, num_skills, hidden_dims)
-        # Which codes the data support, and what values its rewards and discounts allow; filled at the fit's start.
+        # Filled when a fit starts: which codes the data support, and which values rewards and discounts allow.
         self.register_buffer("support_mask", torch.ones(num_skills, dtype=torch.bool))
         self.register_buffer("value_range", torch.tensor([-torch.inf, torch.inf]))
         self._begin(init_from)
-
-    def _check_settings(self) -> None:
-        h = self.hparams
-        rules = [
-            ("num_skills", h.num_skills >= 2, "at least 2: with one code there is nothing to choose"),
-            ("fourier_seen", 0 <= h.fourier_seen <= h.observation_dim, f"in [0, {h.observation_dim}]"),
-            ("tau", 0 < h.tau < 1, "in (0, 1)"),
-            ("alpha", h.alpha >= 0, "0 or more"),
-            ("weight_clip", h.weight_clip > 0, "positive"),
-            ("awr", h.awr in get_args(Solution), " or ".join(get_args(Solution))),
-            ("beta_floor", 0 <= h.beta_floor < 1 / h.num_skills, f"in [0, 1/{h.num_skills})"),
-            ("target_ema", 0 < h.target_ema <= 1, "in (0, 1]"),
-            ("support", 0 <= h.support < 1 / h.num_skills, f"in [0, 1/{h.num_skills})"),
-            ("lr", h.lr > 0, "positive"),
-        ]
-        self._refuse(rules)
-
-    # ---------------------------------------------------------------- what it says about a state
 
     def embed(self, observations: Tensor) -> Tensor:
         """Normalise observations (B, O) and append Fourier features."""
@@ -203,8 +193,8 @@ class PolicyModule(StageModule):
         Args:
             observations: (B, O).
             selection: ``sample`` from pi, ``greedy`` argmax of pi, ``argmax_q`` of the target critic.
-            temperature: divides the logits before sampling; below 1 is nearer to greedy.
-            generator: random stream; the global one without it.
+            temperature: Divides the logits before sampling; below 1 is nearer to greedy.
+            generator: Random stream; the global one by default.
 
         Returns:
             (B,) int64, only codes that the data support.
@@ -220,8 +210,6 @@ class PolicyModule(StageModule):
     def _target_q(self, features: Tensor) -> Tensor:
         """Features (B, F) to the smaller target Q of every code (B, K)."""
         return self.target_critic(features.expand(2, *features.shape)).amin(dim=0)
-
-    # ---------------------------------------------------------------- losses
 
     @property
     def learning(self) -> tuple[str, ...]:
@@ -279,8 +267,6 @@ class PolicyModule(StageModule):
             info |= {**statistics, name: value}
         return total, {name: value.detach() for name, value in info.items()}
 
-    # ---------------------------------------------------------------- Lightning
-
     def on_fit_start(self) -> None:
         """Take statistics, code support and possible values from the relabelled data."""
         self.refuse_frozen_without_weights()
@@ -318,9 +304,7 @@ class PolicyModule(StageModule):
     def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """One optimiser step's loss."""
         total, self.terms = self.loss(batch)
-        if is_log_step(self):
-            log = {"loss": total.detach(), **self.terms}
-            self.log_dict({f"train/{name}": value for name, value in log.items()})
+        self.log_training(total)
         if self.global_step % self.hparams.watch == 0:
             self._watch(self.terms)
         return total
@@ -331,27 +315,25 @@ class PolicyModule(StageModule):
         least, most = info["v_min"].item(), info["v_max"].item()
         slack = 0.1 * (high - low) if high - low < float("inf") else float("inf")
         clipped = info["clipped_share"].item() if "clipped_share" in info else 0.0
-        found = []
-        if least < low - slack or most > high + slack:
-            found.append(
-                f"V runs from {least:.3g} to {most:.3g}, but the data's rewards and discounts allow only {low:.3g} to "
-                f"{high:.3g}: the critic diverges. Check that terminations are in the data, scale the rewards down, or "
-                "lower lr or tau."
-            )
-        if clipped > 0.5:
-            found.append(
-                f"{100 * clipped:.0f} % of the AWR weights are clipped at {self.hparams.weight_clip:g}: the policy "
-                "clones them all alike. Lower alpha or the reward scale."
-            )
-        for message in found:
-            warnings.warn(f"step {self.global_step}: {message}", stacklevel=2)
+        diverges = (
+            f"V runs from {least:.3g} to {most:.3g}, but the data's rewards and discounts allow only {low:.3g} to "
+            f"{high:.3g}: the critic diverges. Check that terminations are in the data, scale the rewards down, or "
+            "lower lr or tau."
+        )
+        clones = (
+            f"{100 * clipped:.0f} % of the AWR weights are clipped at {self.hparams.weight_clip:g}: the policy clones "
+            "them all alike. Lower alpha or the reward scale."
+        )
+        impossible = least < low - slack or most > high + slack
+        for wrong, message in ((impossible, diverges), (clipped > 0.5, clones)):
+            if wrong:
+                warnings.warn(f"step {self.global_step}: {message}", stacklevel=2)
 
     @torch.no_grad()
     def after_step(self, step: int) -> None:
         """Move the target critic towards the critic."""
-        target: list[Tensor] = list(self.target_critic.parameters())
-        online: list[Tensor] = list(self.critic.parameters())
         if "critic" in self.trained_parts:
+            target, online = (list(network.parameters()) for network in (self.target_critic, self.critic))
             torch._foreach_lerp_(target, online, self.hparams.target_ema)
 
     def evaluate(self, batch: dict[str, Tensor], stage: str) -> None:

@@ -143,7 +143,7 @@ def test_continuous_skills_get_codes_by_the_nearest_centre(data):
     observations, actions = torch.randn(9, 5, 4), torch.zeros(9, 5, 2)
     codes = skills.encode(observations, actions)
     with torch.no_grad():
-        means = skill.encode_segments(observations, actions).mean
+        means = skill.encode_segments(observations, actions).vectors
     np.testing.assert_array_equal(codes, torch.cdist(means, skills.centres).argmin(dim=1))
     stream = [torch.Generator().manual_seed(0) for _ in range(2)]
     with torch.no_grad():
