@@ -65,7 +65,7 @@ class DDSAgent(nn.Module):
         """Put the parts together."""
         super().__init__()
         self.skill, self.policy = skill, policy
-        self.selection, self.temperature, self.noise_scale = selection, float(temperature), noise_scale
+        self.selection, self.temperature, self._noise_scale = selection, float(temperature), noise_scale
         self.horizon, self.num_skills = int(skill.horizon), int(skill.num_skills)
         self.observation_dim = int(skill.hparams["observation_dim"])
         self.action_dim = int(skill.hparams["action_dim"])
@@ -86,8 +86,8 @@ class DDSAgent(nn.Module):
             raise UserError(f"selection is '{self.selection}', expected one of {', '.join(choices)}")
         if self.temperature <= 0:
             raise UserError(f"temperature is {self.temperature}, expected more than 0 ('greedy' is the limit)")
-        if self.noise_scale is not None and self.noise_scale < 0:
-            raise UserError(f"noise_scale is {self.noise_scale}, expected 0 or more")
+        if self._noise_scale is not None and self._noise_scale < 0:
+            raise UserError(f"noise_scale is {self._noise_scale}, expected 0 or more")
         if self.policy is None and self.selection not in ("random", "fixed"):
             raise UserError(f"selection '{self.selection}' needs a policy; use 'random' or 'fixed' without")
         if (self.selection == "fixed") != (codes is not None):
@@ -116,10 +116,15 @@ class DDSAgent(nn.Module):
             **settings: `temperature`, `noise_scale`, `fixed_codes`, `seed`, as in the constructor.
         """
         own: dict[str, Any] = {"selection": selection or self.selection, "temperature": self.temperature}
-        own |= {"noise_scale": self.noise_scale, "seed": self._seed}
+        own |= {"noise_scale": self._noise_scale, "seed": self._seed}
         if own["selection"] == "fixed":
             own["fixed_codes"] = self.fixed_codes
         return DDSAgent(self.skill, self.policy, **{**own, **settings})
+
+    @property
+    def noise_scale(self) -> float:
+        """Factor on the decoder's noise: this agent's, or the skill model's where it was given none."""
+        return float(self.skill.hparams["noise_scale"] if self._noise_scale is None else self._noise_scale)
 
     @property
     def num_envs(self) -> int:
@@ -182,18 +187,26 @@ class DDSAgent(nn.Module):
         if not self.num_envs:
             self.reset(len(batch) if rows is None else int(np.max(rows)) + 1)
         rows = np.arange(self.num_envs) if rows is None else np.asarray(rows)
-        if batch.ndim != 2 or batch.shape[1] != self.observation_dim:
-            raise UserError(
-                f"observations are {batch.shape}, expected ({len(rows)}, {self.observation_dim}): this agent "
-                "was trained on another environment, or the observations are not flat"
-            )
+        x = self.observe(batch)
         if len(batch) != len(rows):
             raise UserError(f"{len(batch)} observations for {len(rows)} environments: reset({len(batch)}) first")
         if restarted is not None and np.shape(restarted) != rows.shape:
             raise UserError(f"restarted is {np.shape(restarted)}, expected ({len(rows)},)")
-        x = torch.from_numpy(np.ascontiguousarray(batch)).to(self.device)
         actions = self.decode(x, self.choose(x, restarted, rows))
         return actions[0] if single else actions
+
+    def observe(self, observations: NDArray[np.float32]) -> Tensor:
+        """Move observations (n, O) to the networks' device.
+
+        Raises:
+            UserError: They have another shape.
+        """
+        if observations.ndim != 2 or observations.shape[1] != self.observation_dim:
+            raise UserError(
+                f"observations are {observations.shape}, expected ({len(observations)}, {self.observation_dim}): this "
+                "agent was trained on another environment, or the observations are not flat"
+            )
+        return torch.from_numpy(np.ascontiguousarray(observations)).to(self.device)
 
     def choose(
         self, observations: Tensor, restarted: NDArray[np.bool_] | None, rows: NDArray[np.intp]
@@ -246,7 +259,7 @@ class DDSAgent(nn.Module):
     @property
     def group_key(self) -> tuple[int, float | None]:
         """Agents with equal keys can act in one decoder batch, see `actors.AgentGroup`."""
-        return id(self.skill), self.noise_scale
+        return id(self.skill), self._noise_scale
 
     # ---------------------------------------------------------------- files
 
@@ -298,7 +311,7 @@ class DDSAgent(nn.Module):
         if self.policy is not None:
             modules["policy"] = self.policy
         acting: dict[str, Any] = {"selection": self.selection, "temperature": self.temperature}
-        acting["noise_scale"] = self.noise_scale
+        acting["noise_scale"] = self._noise_scale  # null goes on meaning the skill model's
         acting["fixed_codes"] = None if self.fixed_codes is None else self.fixed_codes.tolist()
         return publish(directory, modules, {**about, "agent": acting, "golden": self.golden()}, metrics, card)
 

@@ -332,8 +332,9 @@ class PolicyModule(StageModule):
     @torch.no_grad()
     def after_step(self, step: int) -> None:
         """Move the target critic towards the critic."""
+        target: list[Tensor] = list(self.target_critic.parameters())
+        online: list[Tensor] = list(self.critic.parameters())
         if "critic" in self.trained_parts:
-            target, online = (list(network.parameters()) for network in (self.target_critic, self.critic))
             torch._foreach_lerp_(target, online, self.hparams.target_ema)
 
     def evaluate(self, batch: dict[str, Tensor], stage: str) -> None:

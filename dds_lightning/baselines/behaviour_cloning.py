@@ -22,6 +22,7 @@ from dds_lightning.errors import UserError
 from dds_lightning.module import adam
 from dds_lightning.nn.mlp import MLP
 from dds_lightning.nn.normaliser import ActionBox, Normaliser
+from dds_lightning.rollout.actors import Acted
 from dds_lightning.tasks import Task
 
 LOG_EVERY = 50
@@ -143,10 +144,10 @@ class CloneActor:
         observations: NDArray[np.float32],
         restarted: NDArray[np.bool_] | None = None,
         rows: NDArray[np.intp] | None = None,
-    ) -> NDArray[np.float32]:
+    ) -> Acted:
         """Actions (n, A) for observations (n, O); see `dds_lightning.rollout.actors.Actor.act`."""
         x = torch.from_numpy(np.ascontiguousarray(observations, dtype=np.float32)).to(self.module.device)
-        return self.module(x).float().cpu().numpy()
+        return Acted(self.module(x).float().cpu().numpy())
 
 
 def fit_clone(

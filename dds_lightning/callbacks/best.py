@@ -1,18 +1,36 @@
 """The checkpoint with the best value of a metric."""
 
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import lightning.pytorch as pl
-from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+
+
+def callback_state(checkpoint: Mapping[str, Any], kind: type[Callback]) -> dict[str, Any] | None:
+    """The state that a callback left in a Lightning checkpoint.
+
+    Lightning files it under the callback's `state_key`: the name of its class, for a `ModelCheckpoint` followed by
+    its settings, so that a training that continues with another metric does not compare with the old one's best.
+
+    Args:
+        checkpoint: As `saving.checkpoint.load_ckpt` reads it.
+        kind: Class of the callback.
+
+    Returns:
+        What its `state_dict` returned; None if there was no such callback.
+    """
+    states = checkpoint.get("callbacks", {})
+    return next((state for key, state in states.items() if key.partition("{")[0] == kind.__qualname__), None)
 
 
 class BestCheckpoint(ModelCheckpoint):
     """Also keep the checkpoint with the best value of a logged metric, as `best.ckpt` beside `last.ckpt`.
 
     Args:
-        monitor: name of the metric, e.g. `rollout/score`; null keeps none.
+        monitor: Name of the metric, e.g. `rollout/score`; null keeps none.
         mode: `max` or `min`.
-        every_n_steps: look after every so many optimiser steps; null looks after validations.
+        every_n_steps: Optimiser steps between two looks at the metric; null looks after validations.
     """
 
     def __init__(

@@ -20,19 +20,19 @@ from numpy.typing import NDArray
 
 from dds_lightning.envs.pool import EnvPool
 from dds_lightning.errors import UserError
-from dds_lightning.rollout.actors import Contestant
+from dds_lightning.rollout.actors import Acted, Contestant
 from dds_lightning.rollout.actors import single_skills as single_skills
 from dds_lightning.rollout.result import RolloutPath as RolloutPath
 from dds_lightning.rollout.result import RolloutResult as RolloutResult
 from dds_lightning.rollout.schedule import (
     DEFAULT_SLOTS,
+    ActorSlots,
     Plan,
-    Seat,
+    assign_slots,
     bundle,
     check_contestants,
     episode_seeds,
     plan_slots,
-    take_seats,
 )
 from dds_lightning.rollout.schedule import episode_seed as episode_seed
 from dds_lightning.rollout.schedule import slots_needed as slots_needed
@@ -93,7 +93,7 @@ def rollout(
         report = stack.enter_context(_progress_bar(count, progress, "success" if task.measures_success else "score"))
         match = _Match(pool, plans, seed, record or record_observations, record_observations, report)
         stack.enter_context(_torch_threads(threads))
-        rows = match.play(take_seats(bundles, plans, seed))
+        rows = match.play(assign_slots(bundles, plans, seed))
     order = {contestant.name: i for i, contestant in enumerate(contestants)}
     rows.sort(key=lambda row: (order[row["actor"]], row["episode"]))
     paths = {(row["actor"], row["episode"]): row.pop("path") for row in rows}
@@ -134,7 +134,7 @@ class _Match:
         width = self.task.observation_dim
         self.seen = np.zeros((count, steps + 1, width), np.float32) if record_observations else None
 
-    def play(self, seats: list[Seat]) -> list[dict[str, Any]]:
+    def play(self, actors: list[ActorSlots]) -> list[dict[str, Any]]:
         """Play to the end; a row an episode, in the order in which they end."""
         pool = self.pool
         start = pool.start([[own[i] for i in todo] for own, todo in zip(self.seeds, self.todo, strict=True)])
@@ -143,7 +143,7 @@ class _Match:
         self._remember(alive, start["position"][alive], start["observation"][alive])
         rows: list[dict[str, Any]] = []
         while len(alive := pool.alive):
-            rows += self._note(alive, pool.step(self._act(seats, alive)))
+            rows += self._note(alive, pool.step(self._act(actors, alive)))
         return rows
 
     def _note(self, slots: NDArray[np.intp], records: NDArray[Any]) -> list[dict[str, Any]]:
@@ -164,29 +164,30 @@ class _Match:
         self._remember(slots[again], records["position"][again], records["observation"][again])
         return rows
 
-    def _act(self, seats: list[Seat], slots: NDArray[np.intp]) -> NDArray[np.float32]:
-        """Everybody's actions (n, A) for some live slots, ascending."""
+    def _act(self, actors: list[ActorSlots], slots: NDArray[np.intp]) -> NDArray[np.float32]:
+        """All actions (n, A) for some live slots, ascending."""
         actions = np.empty((len(slots), self.task.action_dim), np.float32)
-        for seat in seats:
-            low, high = np.searchsorted(slots, (seat.low, seat.high))
+        for one in actors:
+            low, high = np.searchsorted(slots, (one.low, one.high))
             if low < high:
-                actions[low:high] = self._act_one(seat, slots[low:high])
+                actions[low:high] = self._act_one(one, slots[low:high])
         return actions
 
-    def _act_one(self, seat: Seat, slots: NDArray[np.intp]) -> NDArray[np.float32]:
+    def _act_one(self, one: ActorSlots, slots: NDArray[np.intp]) -> NDArray[np.float32]:
         """One actor's actions for its live slots; its codes are noted."""
-        rows = slots - seat.low
-        actions = np.asarray(seat.actor.act(self.observations[slots], self.restarted[slots], rows), dtype=np.float32)
+        acted = one.actor.act(self.observations[slots], self.restarted[slots], slots - one.low)
+        if not isinstance(acted, Acted):
+            acted = Acted(acted)
+        actions = np.asarray(acted.actions, dtype=np.float32)
         if actions.shape != (len(slots), self.task.action_dim):
             expected = (len(slots), self.task.action_dim)
-            raise UserError(f"'{seat.name}' gave actions of shape {actions.shape}, expected {expected}")
+            raise UserError(f"'{one.name}' gave actions of shape {actions.shape}, expected {expected}")
         if not np.isfinite(actions).all():
-            raise UserError(f"'{seat.name}' gave an action that is not finite; has its training diverged?")
-        codes = getattr(seat.actor, "codes", None)
-        if codes is not None:
-            self.codes[slots] = np.asarray(codes)[rows]
-            for row in np.flatnonzero(np.asarray(seat.actor.decided)[rows]):  # type: ignore[attr-defined]
-                self.chosen[slots[row]].append(int(self.codes[slots[row]]))
+            raise UserError(f"'{one.name}' gave an action that is not finite; has its training diverged?")
+        if acted.codes is not None:
+            self.codes[slots] = acted.codes
+        for slot in [] if acted.chosen is None else slots[acted.chosen]:
+            self.chosen[slot].append(int(self.codes[slot]))
         return actions
 
     def _remember(self, slots: NDArray[np.intp], positions: NDArray[Any], observations: NDArray[Any]) -> None:

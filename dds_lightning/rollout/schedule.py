@@ -1,4 +1,4 @@
-"""Who sits where in a rollout: slots for contestants, episodes for slots, seeds for episodes."""
+"""The schedule of a rollout: slots for contestants, episodes for slots, seeds for episodes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dds_lightning.errors import UserError
-from dds_lightning.rollout.actors import Actor, AgentGroup, Contestant
+from dds_lightning.rollout.actors import AgentGroup, Contestant
 
 DEFAULT_SLOTS = 192
 
@@ -81,31 +81,32 @@ def _plan_one(contestant: Contestant, share: float) -> Plan:
     return Plan(contestant, slots)
 
 
-class Seat(NamedTuple):
-    """An actor and the range of slots it plays."""
+class ActorSlots(NamedTuple):
+    """An actor and the range of slots that it plays, `low` to `high` - 1."""
 
     name: str
-    actor: Actor
+    actor: Any
     low: int
     high: int
 
 
-def take_seats(bundles: list[tuple[Any, list[Contestant]]], plans: list[Plan], seed: int) -> list[Seat]:
-    """Reset the actors, grouped ones as one actor."""
+def assign_slots(bundles: list[tuple[Any, list[Contestant]]], plans: list[Plan], seed: int) -> list[ActorSlots]:
+    """Reset the actors for their slots, agents as an `AgentGroup`."""
     by_name = {plan.contestant.name: plan for plan in plans}
-    seats, low = [], 0
+    assigned, low = [], 0
     for _, members in bundles:
         sizes = [len(by_name[member.name].slots) for member in members]
         seeds = [_actor_seed(seed, member.name) for member in members]
         actor = members[0].actor
-        if len(members) > 1:
+        if hasattr(actor, "group_key"):
             actor = AgentGroup([member.actor for member in members])
             actor.reset(sizes, seeds)
         else:
             actor.reset(sizes[0], seeds[0])
-        seats.append(Seat(" + ".join(member.name for member in members), actor, low, low + sum(sizes)))
-        low = seats[-1].high
-    return seats
+        high = low + sum(sizes)
+        assigned.append(ActorSlots(" + ".join(member.name for member in members), actor, low, high))
+        low = high
+    return assigned
 
 
 def _actor_seed(seed: int, name: str) -> int:

@@ -60,8 +60,7 @@ class ActingGraph(nn.Module):
             )
         self.skill, self.policy = agent.skill, agent.policy
         self.by_q, self.temperature = agent.selection == "argmax_q", agent.temperature
-        scale = agent.skill.hparams["noise_scale"] if agent.noise_scale is None else agent.noise_scale
-        self.noise_scale = float(scale)
+        self.noise_scale = agent.noise_scale
         self.eval()
 
     def forward(self, observations: Tensor, codes: Tensor, gumbel: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:

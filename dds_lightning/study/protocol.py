@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dds_lightning.errors import UserError
 from dds_lightning.rollout.schedule import episode_seed
 from dds_lightning.tasks import Task
 from dds_lightning.tasks.facts import PAPERS_DATA
@@ -52,7 +53,7 @@ def protocol(
         "episodes": episodes,
         "seed": seed,
         "checkpoint": checkpoint,
-        "noise_scale": float(settings["noise_scale"] if agent.noise_scale is None else agent.noise_scale),
+        "noise_scale": agent.noise_scale,
         "sampler": settings["sampler"] if settings["decoder"] == "diffusion" else None,
         "temperature": temperature,
         "horizon": agent.horizon,
@@ -90,18 +91,25 @@ def best_facts(last: Path, best: Path) -> dict[str, Any]:
     """How a training chose its best checkpoint, read from its two files.
 
     Args:
-        last: the training's last checkpoint; it knows every evaluation.
-        best: the checkpoint that was kept.
+        last: The training's last checkpoint; it has the history of all evaluations.
+        best: The checkpoint that was kept.
 
     Returns:
-        `monitor` (name of the metric), `value`, `step` and `evaluations`, the number of them that the best was
-        chosen from (None where the metric is no rollout's).
+        `monitor` (name of the metric), `value`, `step` and `evaluations`, how many of them the best was chosen from
+        (None for a metric that no rollout measured).
+
+    Raises:
+        UserError: A file cannot be read, or `best` was not written by a `BestCheckpoint`.
     """
+    from dds_lightning.callbacks.best import BestCheckpoint, callback_state
+    from dds_lightning.callbacks.rollouts import RolloutEvaluation
     from dds_lightning.saving.checkpoint import load_ckpt
 
     checkpoint = load_ckpt(best)
-    kept = next(state for key, state in checkpoint["callbacks"].items() if key.startswith("BestCheckpoint"))
-    evaluated = load_ckpt(last)["callbacks"].get("RolloutEvaluation", {"history": []})
+    kept = callback_state(checkpoint, BestCheckpoint)
+    if kept is None:
+        raise UserError(f"{best} was not kept as a best checkpoint: it has no state of a BestCheckpoint")
+    evaluated = callback_state(load_ckpt(last), RolloutEvaluation) or {"history": []}
     count = sum(kept["monitor"] in row for row in evaluated["history"])
     return {
         "monitor": kept["monitor"],

@@ -14,7 +14,7 @@ import pytest
 
 from dds_lightning.envs.pool import EnvPool, EnvPoolError
 from dds_lightning.errors import UserError
-from dds_lightning.rollout.actors import Contestant, RandomActor
+from dds_lightning.rollout.actors import Acted, Contestant, RandomActor
 from dds_lightning.rollout.play import rollout
 from dds_lightning.rollout.result import RolloutResult
 from dds_lightning.rollout.schedule import episode_seed, slots_needed
@@ -69,10 +69,7 @@ class Coder(Constant):
     """An actor with skills: its code is its row."""
 
     def act(self, observations, restarted, rows):
-        self.codes = np.arange(self.num_envs)
-        self.decided = np.zeros(self.num_envs, bool)
-        self.decided[rows[restarted]] = True
-        return super().act(observations, restarted, rows)
+        return Acted(super().act(observations, restarted, rows), codes=rows, chosen=restarted)
 
 
 @pytest.mark.parametrize("slots", [1, 2, 7, 64])
