@@ -343,3 +343,7 @@ class DDSAgent(nn.Module):
             return cls(skill, policy, **acting)
         except TypeError as error:
             raise UserError(f"{directory}: an agent setting that this version does not know: {error}") from None
+        except UserError as error:
+            if settings:
+                raise  # the caller's may be to blame
+            raise UserError(f"{directory}: {error}") from None

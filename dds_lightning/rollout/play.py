@@ -21,9 +21,7 @@ from numpy.typing import NDArray
 from dds_lightning.envs.pool import EnvPool
 from dds_lightning.errors import UserError
 from dds_lightning.rollout.actors import Acted, Contestant
-from dds_lightning.rollout.actors import single_skills as single_skills
-from dds_lightning.rollout.result import RolloutPath as RolloutPath
-from dds_lightning.rollout.result import RolloutResult as RolloutResult
+from dds_lightning.rollout.result import RolloutPath, RolloutResult
 from dds_lightning.rollout.schedule import (
     DEFAULT_SLOTS,
     ActorSlots,
@@ -34,8 +32,6 @@ from dds_lightning.rollout.schedule import (
     episode_seeds,
     plan_slots,
 )
-from dds_lightning.rollout.schedule import episode_seed as episode_seed
-from dds_lightning.rollout.schedule import slots_needed as slots_needed
 from dds_lightning.tasks import Task, get_task
 
 

@@ -77,9 +77,9 @@ def test_how_the_best_was_chosen_is_read_from_its_files(tmp_path, key):
     for name, checkpoint in (("best", best), ("last", last)):
         torch.save(checkpoint, tmp_path / f"{name}.ckpt")
     facts = best_facts(tmp_path / "last.ckpt", tmp_path / "best.ckpt")
-    with pytest.raises(UserError, match="last.ckpt was not kept as a best checkpoint"):
-        torch.save({**last, "callbacks": played}, tmp_path / "last.ckpt")
-        best_facts(tmp_path / "best.ckpt", tmp_path / "last.ckpt")
+    torch.save({**last, "callbacks": played}, tmp_path / "other.ckpt")
+    with pytest.raises(UserError, match="was not kept as a best checkpoint"):
+        best_facts(tmp_path / "last.ckpt", tmp_path / "other.ckpt")
     assert facts == {"monitor": "rollout/score", "value": 30.0, "step": 10, "evaluations": 2}
     assert best_words(facts) == "best of 2 evaluations while training, step 10: optimistic"
     assert (
