@@ -1,4 +1,4 @@
-"""What every training stage's module shares: checked settings, parts that learn, and their optimiser."""
+"""What the modules of all training stages share: checked settings, trainable parts, and their optimiser."""
 
 import hashlib
 import math
@@ -21,17 +21,19 @@ Schedule = Literal["constant", "cosine"]
 
 
 class StageModule(pl.LightningModule):
-    """What the skill model and the policy share: checked settings, a start from weights, Adam by part.
+    """A training stage's module: checked settings, a start from weights, Adam by part.
 
-    A subclass calls `save_hyperparameters(ignore=["init_from"])`, builds itself, then calls `_begin`.
+    A subclass calls `save_hyperparameters(ignore=["init_from"])`, builds itself (its observations go through
+    `normaliser`), then calls `_begin`. Its settings `lr` and `lr_schedule` are needed; `warmup_steps`, `init_from`,
+    `trainable`, `lr_scale` and `refit_normaliser` are understood where it has them.
     """
 
     hparams: Any  # Lightning gives its settings as attributes, but types them as a mapping
     STAGE: ClassVar[str]
     """Name of the module in a published directory."""
-    PARTS: ClassVar[Mapping[str, tuple[str, ...]]]
+    PARTS: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     """What can be frozen or slowed down, and the submodules that belong to it."""
-    SHAPE: ClassVar[tuple[str, ...]]
+    SHAPE: ClassVar[tuple[str, ...]] = ()
     """Settings in which a checkpoint to start from must agree."""
     OF_DATA: ClassVar[tuple[str, ...]] = ()
     """Buffers that always come from the data."""
@@ -40,19 +42,19 @@ class StageModule(pl.LightningModule):
     init_from: str | None = None  # the checkpoint this module started from, in this process
     terms: Mapping[str, Tensor] = MappingProxyType({})  # of the last training step; `FiniteGuard` names the bad ones
 
-    def check(self, *rules: tuple[str, bool, str]) -> None:
-        """Refuse settings outside their range, those that all stages share included.
+    def _refuse(self, rules: Sequence[tuple[str, bool, str]]) -> None:
+        """Refuse settings outside their range; `rules` are (name, whether the value is allowed, what is expected).
 
-        Args:
-            *rules: Name of a setting, whether its value is allowed, and what is expected.
+        The rules that all stages share come after those.
 
         Raises:
             UserError: Names the first setting that is not allowed.
         """
         h = self.hparams
-        named = [h.trainable] if isinstance(h.trainable, str) else list(h.trainable)
+        allowed = ", ".join(self.PARTS)
+        named = self._named_parts
         parts = bool(named) and (named == ["all"] or set(named) <= set(self.PARTS))
-        scales, allowed = h.lr_scale or {}, ", ".join(self.PARTS)
+        scales = h.get("lr_scale") or {}
         common = [
             ("lr", h.lr > 0, "positive"),
             ("trainable", parts, f"all or some of {allowed}"),
@@ -62,20 +64,24 @@ class StageModule(pl.LightningModule):
         if parts:
             left = ", ".join(self.trained_parts)
             common.append(("lr_scale", set(scales) <= set(self.trained_parts), f"factors for what is trained: {left}"))
-        for name, allows, expected in [*rules, *common]:
-            if not allows:
+        for name, fine, expected in [*rules, *common]:
+            if not fine:
                 raise UserError(f"model.{name} is {h[name]}, expected {expected}")
 
     @property
     def trained_parts(self) -> tuple[str, ...]:
         """Names of the parts that learn."""
-        trainable = self.hparams.trainable
-        named = [trainable] if isinstance(trainable, str) else trainable
+        named = self._named_parts
         return tuple(part for part in self.PARTS if named == ["all"] or part in named)
 
     @property
+    def _named_parts(self) -> list[str]:
+        trainable = self.hparams.get("trainable", "all")
+        return [trainable] if isinstance(trainable, str) else list(trainable)
+
+    @property
     def frozen_modules(self) -> tuple[str, ...]:
-        """Names of the submodules that do not; a Gaussian bottleneck has nothing to freeze and goes on drawing."""
+        """Names of the submodules that do not learn; a Gaussian bottleneck has no weights and keeps drawing."""
         names = (name for part in self.PARTS if part not in self.trained_parts for name in self.PARTS[part])
         return tuple(name for name in names if any(True for _ in getattr(self, name).parameters()))
 
@@ -83,40 +89,40 @@ class StageModule(pl.LightningModule):
         """Freeze what is not trained and load the weights to start from."""
         for name in self.frozen_modules:
             getattr(self, name).requires_grad_(False)
-        self.train(self.training)  # a Trainer leaves the modes as it finds them
+        self.train(self.training)  # a Trainer does not change modes
         if init_from is not None:
             self.init_from = str(init_from)
             start_from(self, self.init_from)
 
     def train(self, mode: bool = True) -> Self:
-        """Put frozen parts in evaluation mode always: dropout and running averages would move them."""
+        """Keep frozen parts in evaluation mode: dropout and running averages would change them."""
         super().train(mode)
         for name in self.frozen_modules:
             getattr(self, name).eval()
         return self
 
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
-        """One optimiser step and what belongs to it.
+        """Take one optimiser step and what belongs to it.
 
-        Not in `on_train_batch_end`: callbacks come before the module there, and a checkpoint that one of them
-        writes would lack what follows the step.
+        Not in `on_train_batch_end`, where callbacks run before the module: a checkpoint written by one of them would
+        lack what follows the step.
         """
         super().optimizer_step(*args, **kwargs)
         self.after_step(self.global_step + 1)  # Lightning counts the step when this returns
 
     def after_step(self, step: int) -> None:
-        """Follow up on optimiser step `step`, counted from 1."""
+        """Update what depends on optimiser step `step`, counted from 1."""
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """A training that goes on does not start from anything."""
+        """Forget `init_from`: a training that continues does not start from weights."""
         self.init_from = None
 
     def refuse_frozen_without_weights(self) -> None:
-        """Refuse to train part of a model whose rest nobody ever trained."""
+        """Refuse to train part of a model whose other parts were never trained."""
         if self.frozen_modules and self.init_from is None and not bool(self.normaliser.fitted):
             raise UserError(
-                f"model.trainable is {self.hparams.trainable}, but the rest has only random weights: give "
-                "--model.init_from=CHECKPOINT, or train all of it"
+                f"model.trainable is {self.hparams.trainable}, but the other parts have random weights: give "
+                "--model.init_from=CHECKPOINT, or train all parts"
             )
 
     def data_statistics(self, names: Sequence[str], remedy: str) -> dict[str, Any]:
@@ -141,21 +147,19 @@ class StageModule(pl.LightningModule):
         return {name: statistics[name] for name in names}
 
     def log_training(self, total: Tensor, more: Callable[[], Mapping[str, Tensor]] = dict) -> None:
-        """Log a training step's loss and terms every ``log_every_n_steps`` steps.
-
-        Logging each step of a small network would cost as much as the step.
+        """Log a training step's loss and terms, at the steps of `is_log_step`.
 
         Args:
             total: The loss.
             more: Computes what else to log; not called at other steps.
         """
-        if self.global_step % max(getattr(self.trainer, "log_every_n_steps", 50), 1) == 0:
+        if is_log_step(self):
             log = {"loss": total.detach(), **self.terms, **more()}
             self.log_dict({f"train/{name}": value for name, value in log.items()})
 
     def evaluate(self, batch: dict[str, Tensor], stage: str) -> None:
         """Log how the model does on a held-out batch; `stage` is the prefix of the names, ``val`` or ``test``."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} has no `evaluate`: write one to validate or test it")
 
     def validation_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
         """Log how the model does on a held-out batch."""
@@ -169,16 +173,16 @@ class StageModule(pl.LightningModule):
         """Adam over everything that learns together, with a learning rate for each part where `lr_scale` says so."""
         h = self.hparams
         parameters: Any = self.parameters()
-        if h.lr_scale:
+        if h.get("lr_scale"):
             parameters = [
-                {"params": own, "lr": h.lr * h.lr_scale.get(part, 1.0), "name": part}
+                {"params": learning, "lr": h.lr * h.lr_scale.get(part, 1.0), "name": part}
                 for part in self.trained_parts
-                if (own := [p for n in self.PARTS[part] for p in getattr(self, n).parameters() if p.requires_grad])
+                if (learning := [p for n in self.PARTS[part] for p in getattr(self, n).parameters() if p.requires_grad])
             ]
-        return adam(parameters, h.lr, h.lr_schedule, h.warmup_steps, self)
+        return adam(parameters, h.lr, h.lr_schedule, h.get("warmup_steps", 0), self)
 
     def fingerprint(self) -> str:
-        """SHA-256 of all weights and buffers with their names: the same for the same model, wherever it lies."""
+        """SHA-256 of all weights and buffers with their names: the same for the same model, wherever it is stored."""
         digest = hashlib.sha256()
         for name, tensor in sorted(self.state_dict().items()):
             digest.update(name.encode())
@@ -187,18 +191,18 @@ class StageModule(pl.LightningModule):
 
     @classmethod
     def starting_from(cls, path: str | Path, **settings: Any) -> Self:
-        """A new training that starts from the weights of a checkpoint, with its settings where none are given.
+        """Start a new training from the weights of a checkpoint, with its settings where none are given.
 
         Args:
             path: `.ckpt` or published directory; the same as `init_from`.
-            **settings: arguments of the constructor. `trainable`, `lr_scale` and `refit_normaliser` are never the
-                checkpoint's: they say how that one was made.
+            **settings: Arguments of the constructor. `trainable`, `lr_scale` and `refit_normaliser` are never the
+                checkpoint's: they describe how that one was trained.
 
         Raises:
-            UserError: as from the constructor.
+            UserError: A setting or the checkpoint is not valid.
         """
-        anew = ("trainable", "lr_scale", "refit_normaliser")
-        trained = {name: value for name, value in read(cls, str(path)).hparams.items() if name not in anew}
+        fresh = ("trainable", "lr_scale", "refit_normaliser")
+        trained = {name: value for name, value in read(cls, str(path)).hparams.items() if name not in fresh}
         return cls(**{**trained, **settings, "init_from": str(path)})
 
     @classmethod
@@ -224,7 +228,7 @@ def adam(
     warmup_steps: int,
     module: pl.LightningModule,
 ) -> Any:
-    """Build Adam in the form Lightning expects, over parameters or over groups of them with rates of their own.
+    """Build Adam in the form Lightning expects, over parameters or groups of them with their own rates.
 
     Reads ``trainer.max_steps`` only: ``estimated_stepping_batches`` builds the loaders early and breaks resuming.
     """
@@ -242,3 +246,9 @@ def adam(
 
     scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
     return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+
+def is_log_step(module: pl.LightningModule) -> bool:
+    """Whether this step is logged: `log_dict` at every step of a small network costs as much as the step."""
+    every = getattr(module.trainer, "log_every_n_steps", 50)
+    return module.global_step % max(every, 1) == 0

@@ -35,7 +35,6 @@ Selection = Literal["sample", "greedy", "argmax_q"]
 Solution = Literal["regression", "closed_form"]
 Loss = tuple[Tensor, dict[str, Tensor]]  # a scalar to minimise, and statistics to log beside it
 STATISTICS = ("observation_mean", "observation_std", "code_share", "reward_range", "max_discount")
-"""What a data module's `statistics()` must provide: the arguments of `fit_statistics`."""
 
 
 class Judged(NamedTuple):
@@ -130,7 +129,7 @@ class PolicyModule(StageModule):
         super().__init__()
         hidden_dims = list(hidden_dims)
         self.save_hyperparameters(ignore=["init_from"])
-        self.check(
+        rules = [
             ("num_skills", num_skills >= 2, "at least 2: with one code there is nothing to choose"),
             ("fourier_seen", 0 <= fourier_seen <= observation_dim, f"in [0, {observation_dim}]"),
             ("tau", 0 < tau < 1, "in (0, 1)"),
@@ -140,7 +139,8 @@ class PolicyModule(StageModule):
             ("beta_floor", 0 <= beta_floor < 1 / num_skills, f"in [0, 1/{num_skills})"),
             ("target_ema", 0 < target_ema <= 1, "in (0, 1]"),
             ("support", 0 <= support < 1 / num_skills, f"in [0, 1/{num_skills})"),
-        )
+        ]
+        self._refuse(rules)
         self.num_skills = num_skills
         self.normaliser = Normaliser(observation_dim)
         self.features: nn.Module = nn.Identity()

@@ -50,39 +50,39 @@ class SkillModule(StageModule):
         encoder: ``transformer`` (the paper) or ``gru`` of the same size.
         decoder: ``diffusion`` (the paper) or ``mlp``, the same backbone as a regressor.
         bottleneck: ``vq`` for discrete skills, ``gaussian`` for the continuous comparison.
-        hidden_dim: width of encoder and decoder.
-        encoder_layers: transformer or GRU layers.
-        encoder_heads: attention heads.
-        decoder_blocks: residual blocks of the decoder.
-        dropout: rate in encoder and decoder.
+        hidden_dim: Width of encoder and decoder.
+        encoder_layers: Transformer or GRU layers.
+        encoder_heads: Attention heads.
+        decoder_blocks: Residual blocks of the decoder.
+        dropout: Rate in encoder and decoder.
         diffusion_steps: T.
-        beta_min: start of the VP schedule.
-        beta_max: end of the VP schedule.
-        time_dim: width of the time embedding.
+        beta_min: Start of the VP schedule.
+        beta_max: End of the VP schedule.
+        time_dim: Width of the time embedding.
         sampler: ``ddpm`` or ``ddim``.
-        noise_scale: factor on the noise drawn while acting (1: the model's own distribution).
-        clip_actions: keep the predicted x0 in the action box while sampling.
-        reconstruction: ``sum`` over H and A as in equation 13, or ``mean``. It sets how the denoising loss weighs
-            against the codebook terms.
-        commitment: beta of equation 14.
-        kl_weight: weight of the KL term of the Gaussian bottleneck.
+        noise_scale: Factor on the noise drawn while acting (1: the model's own distribution).
+        clip_actions: Keep the predicted x0 in the action box while sampling.
+        reconstruction: ``sum`` over H and A as in equation 13, or ``mean``. It sets the weight of the denoising loss
+            relative to the codebook terms.
+        commitment: Beta of equation 14.
+        kl_weight: Weight of the KL term of the Gaussian bottleneck.
         codebook_init: ``kmeans`` of encodings before the first step, ``uniform`` in +-1/K (VQ-VAE), or ``normal``.
-        codebook_ema: decay of an EMA codebook; null trains the vectors by the codebook loss.
-        restart_threshold: a code used less than this share of 1/K is dead and restarts from the data; 0 never. With
-            ``init_from`` take 0 to keep a policy that learnt with the old codes: what the new data do not use would
+        codebook_ema: Decay of an EMA codebook; null trains the vectors by the codebook loss.
+        restart_threshold: A code used less than this share of 1/K is dead and restarts from the data; 0 never. With
+            ``init_from``, 0 keeps a policy that was trained on the old codes: codes that the new data do not use would
             restart too, and mean something else.
-        restart_every: steps between two looks for dead codes.
-        restart_until: share of the training after which no code is moved any more, so that decoding settles.
+        restart_every: Steps between two searches for dead codes.
+        restart_until: Share of the training after which no code moves any more, so that the decoder can settle.
         lr: Adam's learning rate.
         lr_schedule: ``constant`` (the paper) or ``cosine`` decay to zero at ``max_steps``.
-        warmup_steps: steps of linear warm-up.
+        warmup_steps: Steps of linear warm-up.
         init_from: ``.ckpt`` or published directory whose weights to start from (`dds_lightning.finetune`).
         trainable: ``all``, or some of ``encoder``, ``codebook`` and ``decoder``; the rest does not change by a bit.
-        lr_scale: factor on ``lr`` by part, such as ``{encoder: 0.1}``; 1 for a part that is not named.
-        refit_normaliser: with ``init_from``, take the statistics of the new data, not the checkpoint's.
+        lr_scale: Factor on ``lr`` by part, such as ``{encoder: 0.1}``; 1 for a part that is not named.
+        refit_normaliser: With ``init_from``, take the statistics of the new data, not the checkpoint's.
 
     Raises:
-        UserError: a setting outside its range; the message names it.
+        UserError: A setting is outside its range; the message names it.
     """
 
     STAGE = "skill"
@@ -133,7 +133,7 @@ class SkillModule(StageModule):
         super().__init__()
         only_codebook = trainable in ("codebook", ["codebook"])
         self.save_hyperparameters(ignore=["init_from"])
-        self.check(
+        rules = [
             ("num_skills", num_skills >= 2, "at least 2: with one code the policy has nothing to choose"),
             ("horizon", horizon >= 1, "at least 1"),
             ("diffusion_steps", diffusion_steps >= 1, "at least 1"),
@@ -144,7 +144,8 @@ class SkillModule(StageModule):
             ("codebook_ema", codebook_ema is None or 0 < codebook_ema < 1, "null or in (0, 1)"),
             ("trainable", not only_codebook or bottleneck == "vq", "all: a gaussian bottleneck has no codebook"),
             ("trainable", not only_codebook or codebook_ema is None, "more, or codebook_ema: null to give it a loss"),
-        )
+        ]
+        self._refuse(rules)
         space = BOTTLENECKS[bottleneck]
         self.horizon, self.num_skills, self.discrete = horizon, num_skills, space.discrete
         self.normaliser = Normaliser(observation_dim)
@@ -264,7 +265,7 @@ class SkillModule(StageModule):
             self.action_box.fit(low, high)
 
         def first() -> Tensor:
-            # A loader of its own: looking at the data must not move the training's place in it.
+            # A separate loader: reading data here must not move the training's position.
             loader: Any = datamodule.train_dataloader() if datamodule else self.trainer.train_dataloader
             return self._encodings_of(islice(iter(loader), START_BATCHES))
 
@@ -319,7 +320,7 @@ class SkillModule(StageModule):
             self.usage.update(skill.codes)
 
     def on_validation_epoch_start(self) -> None:
-        """Forget earlier epochs here: what `Trainer.validate` left are inference tensors, which no fit may change."""
+        """Reset the metrics here: `Trainer.validate` leaves inference tensors, which a fit must not change."""
         self.reconstruction_rmse.reset()
         self.usage.reset()
 

@@ -43,14 +43,14 @@ class BestCheckpoint(ModelCheckpoint):
             save_top_k=1,
             enable_version_counter=False,
             every_n_train_steps=every_n_steps,
-            save_on_train_epoch_end=False,  # after the validation: `RollingCheckpoint` keeps what this one knows then
+            save_on_train_epoch_end=False,  # but after validation, so that `RollingCheckpoint` saves its state
         )
         self.every_n_steps = every_n_steps
 
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Look right after the step: at an epoch's end Lightning waits for a validation, and keeps later weights."""
+        """Check right after the step: at an epoch's end Lightning waits for a validation, and saves later weights."""
         if not self.every_n_steps or trainer.global_step % self.every_n_steps:
             return
         candidates = self._monitor_candidates(trainer)

@@ -33,7 +33,7 @@ class Bottleneck(nn.Module):
     """A skill space: encodings in, skills out.
 
     A new one is a subclass with `build` and `forward`, and a row in `skill.BOTTLENECKS`. The other methods do nothing
-    unless a subclass has vectors of its own to start, revive and report on.
+    unless a subclass has vectors to start, revive and report on.
     """
 
     discrete: ClassVar[bool] = False
@@ -76,7 +76,7 @@ class Bottleneck(nn.Module):
             generator: The random stream.
 
         Returns:
-            The rows (R,) that moved, by parameter; whoever holds an optimiser must reset their moments.
+            The rows (R,) that moved, by parameter; the optimiser must reset their moments.
         """
         return {}
 

@@ -112,7 +112,7 @@ class EveryRow:
     """Lets an actor that always acts in all of its environments play on when some of them have finished.
 
     Args:
-        actor: with `reset(num_envs, seed)` and `act(observations, restarted)`.
+        actor: With `reset(num_envs, seed)` and `act(observations, restarted)`.
     """
 
     def __init__(self, actor: Any) -> None:

@@ -1,11 +1,11 @@
-"""Vectorised episodes of several contestants over real environments, and one result row an episode.
+"""Vectorised episodes of several contestants over real environments, and one row of results per episode.
 
-Contestants play side by side in one `EnvPool`. Each has slots of its own and a fixed split of its episodes
-over them, so an episode that fails slowly counts as much as one that succeeds fast. Episode i of every
+Contestants play side by side in one `EnvPool`. Each has its own slots and a fixed split of its episodes over
+them, so an episode that fails slowly counts as much as one that succeeds fast. Episode i of every
 contestant starts from the same environment seed: comparisons are paired.
 
 The same call gives the same table: it depends on task, contestants, `seed` and `slots` (the rows of a batch
-share the actor's random stream), not on `workers` or how busy the machine is.
+share the actor's random stream), not on `workers` or the load of the machine.
 """
 
 from __future__ import annotations
@@ -48,20 +48,20 @@ def rollout(
     pool: EnvPool | None = None,
     threads: int = 1,
 ) -> RolloutResult:
-    """Let contestants play their episodes.
+    """Play the episodes of all contestants.
 
     Args:
-        task: the environment, or its name.
-        contestants: who plays.
-        seed: of environments and actors.
-        workers: processes that step environments; None one a core, 0 none but this.
-        slots: environments in all; more are used when there are more contestants and labels.
-        progress: show a bar when standard error is a terminal.
-        record: keep the path of every episode.
-        record_observations: keep the observations as well.
-        pool: play in these environments instead of new ones; `workers` is then not used, and `slots` is
+        task: The environment, or its name.
+        contestants: Who plays, and how often.
+        seed: Seed of environments and actors.
+        workers: Processes that step environments; None for one a core, 0 for this process only.
+        slots: Environments in all; more are used when there are more contestants and labels.
+        progress: Show a bar when standard error is a terminal.
+        record: Keep the path of every episode.
+        record_observations: Keep the observations as well.
+        pool: Play in these environments instead of new ones; `workers` is then not used, and `slots` is
             bounded by its size.
-        threads: torch's threads while acting. One is best for small networks and on a busy machine, where
+        threads: Torch's threads while acting. One is best for small networks and on a busy machine, where
             threads that wait for a core cost far more than they bring; large networks on idle cores gain from
             more. The last bits of the table may depend on it.
 
@@ -69,8 +69,8 @@ def rollout(
         The table of episodes, in the contestants' order, and the recorded paths.
 
     Raises:
-        UserError: contestants that cannot be played; the message names them.
-        EnvPoolError: an environment failed.
+        UserError: Contestants that cannot play; the message names them.
+        EnvPoolError: An environment failed.
     """
     task = get_task(task) if isinstance(task, str) else task
     check_contestants(contestants)
@@ -79,7 +79,7 @@ def rollout(
     if pool is not None and pool.task != task:
         raise UserError(f"the pool has environments of '{pool.task.name}', expected '{task.name}'")
     bundles = bundle(contestants)
-    members = [contestant for _, own in bundles for contestant in own]
+    members = [contestant for _, bundled in bundles for contestant in bundled]
     plans = plan_slots(members, slots, pool.num_envs if pool else None)
     total = sum(len(plan.slots) for plan in plans)
     with contextlib.ExitStack() as stack:
@@ -116,7 +116,7 @@ class _Match:
     ) -> None:
         self.pool, self.task, self.report = pool, pool.task, report
         self.who = [plan.contestant for plan in plans for _ in plan.slots]
-        self.todo = [list(own) for plan in plans for own in plan.slots]
+        self.todo = [list(episodes) for plan in plans for episodes in plan.slots]
         self.seeds = [episode_seeds(plan.contestant, seed) for plan in plans for _ in plan.slots]
         count, steps = len(self.todo), self.task.max_episode_steps
         self.turn = np.zeros(count, dtype=np.int64)
@@ -131,9 +131,9 @@ class _Match:
         self.seen = np.zeros((count, steps + 1, width), np.float32) if record_observations else None
 
     def play(self, actors: list[ActorSlots]) -> list[dict[str, Any]]:
-        """Play to the end; a row an episode, in the order in which they end."""
+        """Play to the end; return one row per episode, in the order in which they end."""
         pool = self.pool
-        start = pool.start([[own[i] for i in todo] for own, todo in zip(self.seeds, self.todo, strict=True)])
+        start = pool.start([[seeds[i] for i in todo] for seeds, todo in zip(self.seeds, self.todo, strict=True)])
         self.observations, self.restarted = start["observation"].copy(), start["alive"].copy()
         alive = pool.alive
         self._remember(alive, start["position"][alive], start["observation"][alive])
@@ -143,7 +143,7 @@ class _Match:
         return rows
 
     def _note(self, slots: NDArray[np.intp], records: NDArray[Any]) -> list[dict[str, Any]]:
-        """Take in one step of some slots: the rows of the episodes that have ended."""
+        """Record one step of some slots; return the rows of the episodes that have ended."""
         if self.in_use is not None:
             self.in_use[slots, self.lengths[slots]] = self.codes[slots]
         self.returns[slots] += records["reward"]
@@ -193,7 +193,7 @@ class _Match:
             self.seen[slots, self.lengths[slots]] = observations
 
     def _finish(self, slot: int, record: Any) -> dict[str, Any]:
-        """The row of the episode that has just ended in a slot, and a clean slate for the next."""
+        """Return the row of the episode that has just ended in a slot, and reset the slot for the next."""
         contestant, episode = self.who[slot], self.todo[slot][self.turn[slot]]
         length = int(self.lengths[slot])
         path = None

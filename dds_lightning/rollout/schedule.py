@@ -26,39 +26,39 @@ def check_contestants(contestants: Sequence[Contestant]) -> None:
     """Refuse contestants that cannot be played.
 
     Raises:
-        UserError: names the contestant and what is wrong.
+        UserError: Names the contestant and what is wrong.
     """
     if not contestants:
-        raise UserError("contestants is empty: there is nobody to play")
+        raise UserError("contestants is empty, expected at least one")
     for name, count in Counter(contestant.name for contestant in contestants).items():
         if count > 1:
             raise UserError(f"contestant '{name}' appears {count} times: names must differ")
     if len({id(contestant.actor) for contestant in contestants}) < len(contestants):
-        raise UserError("two contestants share one actor object; give each its own (an agent's `variant()`)")
+        raise UserError("two contestants share one actor object; give each its own, for example `agent.variant()`")
     for name, episodes, labels in ((one.name, one.episodes, one.labels) for one in contestants):
         if episodes < 1:
             raise UserError(f"contestant '{name}': episodes is {episodes}, expected 1 or more")
         if labels is not None and len(labels) != episodes:
-            raise UserError(f"contestant '{name}': {len(labels)} labels for {episodes} episodes, one each expected")
+            raise UserError(f"contestant '{name}': {len(labels)} labels for {episodes} episodes, expected one each")
 
 
 def bundle(contestants: Sequence[Contestant]) -> list[tuple[Any, list[Contestant]]]:
-    """Contestants whose actors can act in one batch, together."""
+    """Group contestants whose actors can act in one batch."""
     bundles: dict[Any, list[Contestant]] = {}
     for contestant in contestants:
-        own = getattr(contestant.actor, "group_key", None)
-        key = contestant.name if own is None else (type(contestant.actor), own)
+        group = getattr(contestant.actor, "group_key", None)
+        key = contestant.name if group is None else (type(contestant.actor), group)
         bundles.setdefault(key, []).append(contestant)
     return list(bundles.items())
 
 
 def slots_needed(contestants: Sequence[Contestant], slots: int = DEFAULT_SLOTS) -> int:
-    """Environments that a rollout of these contestants with `slots` uses."""
+    """Return how many environments a rollout of these contestants with `slots` uses."""
     return sum(len(plan.slots) for plan in plan_slots(contestants, slots))
 
 
 def plan_slots(contestants: Sequence[Contestant], slots: int, most: int | None = None) -> list[Plan]:
-    """Everybody's plan, with fewer slots each if there are no more than `most`."""
+    """Plan all contestants, with fewer slots each if only `most` are available."""
     episodes = sum(contestant.episodes for contestant in contestants)
     for limit in range(slots, 0, -1):
         plans = [_plan_one(contestant, limit * contestant.episodes / episodes) for contestant in contestants]
@@ -77,7 +77,7 @@ def _plan_one(contestant: Contestant, share: float) -> Plan:
     most = max(map(len, members.values()))
     wide = max(1, int(share / len(members)))  # slots a label
     wide = -(-most // -(-most // wide))  # no wider than the longest slot's episodes need
-    slots = [own[turn::wide] for turn in range(wide) for own in members.values()]
+    slots = [episodes[turn::wide] for turn in range(wide) for episodes in members.values()]
     return Plan(contestant, slots)
 
 
@@ -114,7 +114,7 @@ def _actor_seed(seed: int, name: str) -> int:
 
 
 def episode_seeds(contestant: Contestant, seed: int) -> list[int]:
-    """Seed of each episode: the i-th of every label has the same."""
+    """Return the seed of each episode: the i-th of every label has the same."""
     counts: Counter[str] = Counter()
     seeds = []
     for episode in range(contestant.episodes):

@@ -27,13 +27,13 @@ def agent_card(
     """Write the card.
 
     Args:
-        task: where the agent acts.
-        episodes: the rollout's table; its first contestant is how the agent acts by default.
-        seed: of training and evaluation.
-        data: facts about the data, name to value; "source" is where they come from, as `--data` takes it, or a
+        task: Where the agent acts.
+        episodes: The rollout's table; its first contestant is how the agent acts by default.
+        seed: Of training and evaluation.
+        data: Facts about the data, name to value; "source" is where they come from, as `--data` takes it, or a
             sentence that begins with "collected" where they were made for this agent.
         settings: "skill" and "policy" to the parsed settings of their training.
-        command: what makes the same agent again.
+        command: What makes the same agent again.
     """
     table = summary_table(episodes)
     table = table[table["kind"] == CONTESTANT]
@@ -78,8 +78,8 @@ def with_diagnosis(card: str, run: Path) -> str:
     """The card with the section that says which stage loses, before the data.
 
     Args:
-        card: as `agent_card` wrote it.
-        run: the run directory, its report included.
+        card: As `agent_card` wrote it.
+        run: The run directory, its report included.
     """
     measured = {stage: run / "report" / f"{stage}_metrics.csv" for stage in ("skill", "policy")}
     logs = {stage: path for stage, path in measured.items() if path.is_file()}

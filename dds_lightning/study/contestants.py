@@ -32,11 +32,11 @@ def way(
     """One way of choosing skills as a contestant.
 
     Args:
-        agent: whose skills and policy.
-        selection: as in `DDSAgent`.
-        episodes: how many it plays.
-        temperature: of `sample`.
-        best: facts of the checkpoint (see `protocol.best_facts`), if it is not the last one; its name says so.
+        agent: Whose skills and policy.
+        selection: As in `DDSAgent`.
+        episodes: How many it plays.
+        temperature: Of `sample`.
+        best: Facts of the checkpoint (see `protocol.best_facts`), if it is not the last one; its name says so.
     """
     name = way_name(selection, temperature) + (f" ({best_words(best)})" if best else "")
     return Contestant(name, agent.variant(selection, temperature=temperature), episodes)  # type: ignore[arg-type]
@@ -66,13 +66,13 @@ def final_table(
     """Everyone in the table at the end of `dds run`.
 
     Args:
-        agent: the trained agent; its own selection and temperature are the table's first row.
-        task: where they play.
-        episodes: for each contestant.
-        episodes_per_skill: for each single skill alone.
-        clone: actor of the behaviour-cloning baseline, if there is one.
-        controller: actor that made the data, if there is one.
-        best: ways of choosing of the best checkpoint, if one was kept.
+        agent: The trained agent; its own selection and temperature are the table's first row.
+        task: Where they play.
+        episodes: For each contestant.
+        episodes_per_skill: For each single skill alone.
+        clone: Actor of the behaviour-cloning baseline, if there is one.
+        controller: Actor that made the data, if there is one.
+        best: Ways of choosing of the best checkpoint, if one was kept.
     """
     ways = [
         (agent.selection, agent.temperature),
@@ -120,7 +120,7 @@ def agent_directory(directory: Path) -> Path:
     """The published agent of a run directory, or the directory itself if it is a published one.
 
     Raises:
-        UserError: it is neither.
+        UserError: It is neither.
     """
     if not directory.is_dir():
         raise UserError(f"there is no folder {directory}: give a run of `dds run` or a published checkpoint")

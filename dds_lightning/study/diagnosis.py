@@ -46,7 +46,7 @@ def diagnose(found: Findings, logs: Mapping[str, Path]) -> dict[str, pd.DataFram
     """The small tables of the report's section on where the run loses; what nobody measured is left out.
 
     Args:
-        found: what the run found.
+        found: What the run found.
         logs: "skill" and "policy" to the metrics.csv of their training.
 
     Returns:

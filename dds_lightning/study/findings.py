@@ -23,15 +23,15 @@ class Findings:
     """Everything a report tells, read from one run directory.
 
     Attributes:
-        root: the run directory.
-        task: what was played.
-        result: the evaluation's episodes and paths.
-        main: the contestant the run is about: the published agent as it acts by default.
-        singles: the contestant whose parts are the single skills; None if they did not play.
-        summary: see `tables.summary_table`.
-        failures: see `tables.failures_table`.
-        skills: see `tables.skills_table`.
-        markers: stage -> its marker.
+        root: The run directory.
+        task: What was played.
+        result: The evaluation's episodes and paths.
+        main: The contestant the run is about: the published agent as it acts by default.
+        singles: The contestant whose parts are the single skills; None if they did not play.
+        summary: See `tables.summary_table`.
+        failures: See `tables.failures_table`.
+        skills: See `tables.skills_table`.
+        markers: Stage -> its marker.
     """
 
     root: Path
@@ -49,7 +49,7 @@ class Findings:
         """Read a run directory.
 
         Raises:
-            UserError: it holds no evaluation, one of a task that this version does not know, or a stage of a newer
+            UserError: It holds no evaluation, one of a task that this version does not know, or a stage of a newer
                 version.
         """
         if not (root / "evaluate" / "episodes.parquet").is_file():

@@ -19,9 +19,9 @@ def page(found: Findings, files: Mapping[str, str], diagnosis: Mapping[str, pd.D
     """The report as Markdown.
 
     Args:
-        found: what it tells.
-        files: name -> file beside it, of those that were made.
-        diagnosis: the tables of `diagnosis.diagnose`.
+        found: What it tells.
+        files: Name -> file beside it, of those that were made.
+        diagnosis: The tables of `diagnosis.diagnose`.
     """
     parts = [f"# {found.task.name}", _opening(found), _results(found)]
     if "scores" in files:
@@ -67,8 +67,8 @@ def headline(row: pd.Series, task: Task) -> str:
     """What a contestant reached, in half a sentence: the number that the task is judged by comes first.
 
     Args:
-        row: of `tables.summary_table`.
-        task: what was played.
+        row: Of `tables.summary_table`.
+        task: What was played.
     """
     error = "" if pd.isna(row["score_error"]) else f" ± {row['score_error']:.1f}"
     if not task.measures_success:

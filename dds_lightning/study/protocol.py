@@ -32,13 +32,13 @@ def protocol(
     """Everything a score depends on beside the weights.
 
     Args:
-        task: what is played, in its variant.
-        agent: who plays.
-        episodes: of each contestant.
-        seed: of environments and agents.
-        temperature: of sampled codes.
+        task: What is played, in its variant.
+        agent: Who plays.
+        episodes: Of each contestant.
+        seed: Of environments and agents.
+        temperature: Of sampled codes.
         checkpoint: "last", "best" or "last and best".
-        best: facts of the best checkpoint, see `best_facts`, where it plays too.
+        best: Facts of the best checkpoint, see `best_facts`, where it plays too.
 
     Returns:
         Plain values: `task` (with its variant), `environment`, `episodes`, `seed`, `checkpoint`, `noise_scale`

@@ -39,7 +39,7 @@ def write_report(run_dir: str | Path) -> dict[str, Any]:
     """Write `report/` of a run directory; every file whole or not at all.
 
     Args:
-        run_dir: a directory of `dds run`, evaluated.
+        run_dir: A directory of `dds run`, evaluated.
 
     Returns:
         Paths of the files by name, and the facts that `told` prints, as plain JSON values: `task`, `main` (the
@@ -48,7 +48,7 @@ def write_report(run_dir: str | Path) -> dict[str, Any]:
         `diagnosis` (see `diagnosis.diagnose`).
 
     Raises:
-        UserError: nothing has been evaluated there, or a file is damaged.
+        UserError: Nothing has been evaluated there, or a file is damaged.
     """
     from dds_lightning.console.reports import plain
     from dds_lightning.study.page import page
@@ -85,7 +85,7 @@ def report(run_dir: str | Path) -> Report:
     """Write the report of a run directory once more, and tell what is in it.
 
     Raises:
-        UserError: as `write_report`.
+        UserError: As `write_report`.
     """
     from dds_lightning.console.reports import Report
 

@@ -24,10 +24,10 @@ def replay_skills(task: Task, agent: DDSAgent, steps: int = 50, seed: int = 0) -
     """Play every skill alone from every junction, the body at rest.
 
     Args:
-        task: a maze.
-        agent: its decoder is used, its policy is not.
+        task: A maze.
+        agent: Its decoder is used, its policy is not.
         steps: T of each replay, if it does not reach the goal before.
-        seed: of the decoder's noise.
+        seed: Of the decoder's noise.
 
     Returns:
         `starts` (N, 2) where the body was set down, the same for all skills of a cell, `positions`
@@ -43,9 +43,9 @@ def stored_replays(path: Path, task: Task, directory: Path) -> Arrays:
     """The replays in `path`; made and written there first unless they are of this agent already.
 
     Args:
-        path: the `.npz` file.
-        task: a maze.
-        directory: the published agent.
+        path: The `.npz` file.
+        task: A maze.
+        directory: The published agent.
     """
     from dds_lightning.agent import DDSAgent
 

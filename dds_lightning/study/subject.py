@@ -30,11 +30,11 @@ class Subject:
     """What an atlas is about.
 
     Attributes:
-        agent: its skills, and its policy if there is one.
-        task: name of the task; None where nothing says it.
-        data: where the data are, `SOURCE:NAME`; None where nothing says it.
-        found: the evaluation of a finished run; None elsewhere.
-        about: what it is, in words.
+        agent: Its skills, and its policy if there is one.
+        task: Name of the task; None where nothing says it.
+        data: Where the data are, `SOURCE:NAME`; None where nothing says it.
+        found: The evaluation of a finished run; None elsewhere.
+        about: What it is, in words.
     """
 
     agent: DDSAgent
@@ -48,11 +48,11 @@ def find_subject(place: Path, seed: int = 0) -> Subject:
     """Look at a place.
 
     Args:
-        place: a run of `dds run` that has learnt its skills at least, a published directory, or a skill checkpoint.
-        seed: of the agent.
+        place: A run of `dds run` that has learnt its skills at least, a published directory, or a skill checkpoint.
+        seed: Of the agent.
 
     Raises:
-        UserError: it is none of these.
+        UserError: It is none of these.
     """
     if place.is_file() or place.suffix == ".ckpt":
         return Subject(_skills_alone(place, seed), None, None, None, f"skill checkpoint {place}")
@@ -101,8 +101,8 @@ def atlas(
     """Make and write the atlas of a place; the arguments are those of `dds atlas`.
 
     Raises:
-        UserError: no skills there, no data or no task known, or they do not fit each other.
-        DataError: data that are damaged or another task's.
+        UserError: No skills there, no data or no task known, or they do not fit each other.
+        DataError: Data that are damaged or another task's.
     """
     from datamodules.relabel import check_widths
     from datamodules.sources import load_trajectories, resolve_task

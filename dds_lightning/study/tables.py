@@ -19,9 +19,9 @@ def wilson(successes: int, episodes: int, confidence: float = 0.95) -> tuple[flo
     """Wilson's score interval of a success rate (Wilson, 1927), sound also at 0 and at all successes.
 
     Args:
-        successes: how many.
-        episodes: out of how many.
-        confidence: coverage, for example 0.95.
+        successes: How many.
+        episodes: Out of how many.
+        confidence: Coverage, for example 0.95.
 
     Returns:
         Lower and upper bound in [0, 1]; both NaN without episodes.
@@ -43,7 +43,7 @@ def summary_table(episodes: pd.DataFrame) -> pd.DataFrame:
     """One row a contestant; under one of several parts the best of them and each.
 
     Args:
-        episodes: as in `RolloutResult.episodes`.
+        episodes: As in `RolloutResult.episodes`.
 
     Returns:
         Columns `contestant` (its name says how codes are chosen), `kind` ("contestant", "best" or "skill"),
@@ -104,8 +104,8 @@ def failures_table(episodes: pd.DataFrame, task: Task) -> pd.DataFrame:
     """Where failed episodes ended and with which skill, the commonest end first; none where nothing can fail.
 
     Args:
-        episodes: as in `RolloutResult.episodes`.
-        task: says which cell a position is in.
+        episodes: As in `RolloutResult.episodes`.
+        task: Says which cell a position is in.
 
     Returns:
         Columns `contestant`, `row` and `column` of the end cell (missing where there is no maze), `skill` in
@@ -148,10 +148,10 @@ def skills_table(
     """One row a code: how often the data use it and the policy chooses it, what it does, how it scores alone.
 
     Args:
-        chosen: the codes of each of the policy's episodes.
-        data: summary of the relabelled data (`relabel/codes.csv`), if there is one.
-        alone: episodes of the single skills (rows of `RolloutResult.episodes`), if they played.
-        effects: columns of `data` that tell what a segment of the code does, in the data's units.
+        chosen: The codes of each of the policy's episodes.
+        data: Summary of the relabelled data (`relabel/codes.csv`), if there is one.
+        alone: Episodes of the single skills (rows of `RolloutResult.episodes`), if they played.
+        effects: Columns of `data` that tell what a segment of the code does, in the data's units.
 
     Returns:
         Columns `skill`, `in data`, `chosen` (per cent), the effects, `alone` (mean normalised score, in a maze
@@ -236,8 +236,8 @@ def markdown(table: pd.DataFrame, formats: Mapping[str, str] | None = None) -> s
     """A DataFrame as a Markdown table: numbers to the right, missing values as a dash.
 
     Args:
-        table: small.
-        formats: column -> format of its numbers, for example ".1f".
+        table: Small.
+        formats: Column -> format of its numbers, for example ".1f".
     """
     formats = formats or {}
     header = [str(column) for column in table.columns]

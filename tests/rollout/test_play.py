@@ -244,7 +244,7 @@ def test_a_pool_is_reused_and_a_rollout_in_progress_is_abandoned():
 @pytest.mark.parametrize(
     ("contestants", "message"),
     [
-        ([], "nobody"),
+        ([], "contestants is empty"),
         ([Contestant("a", Constant(0), 0)], "'a': episodes is 0"),
         ([Contestant("a", Constant(0), 2, ["x"])], "1 labels for 2"),
         ([Contestant("a", Constant(0), 1), Contestant("a", Constant(0), 1)], "'a' appears 2 times"),
