@@ -1,4 +1,4 @@
-"""What several commands take and how it is read."""
+"""Arguments that several commands share, and how they are read."""
 
 from pathlib import Path
 

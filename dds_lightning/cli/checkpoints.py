@@ -18,7 +18,7 @@ def publish(
     card: str | None = None,
     public: bool = False,
 ) -> Report:
-    """Make a directory of an agent that others can load and trust, or push it to the Hugging Face hub.
+    """Make a directory of an agent that others can load and trust, or push it to the Hugging Face Hub.
 
     The directory holds the weights (safetensors), settings, scores, a card (a run's says which stage loses) and the
     hashes of all files; nothing in it is ever run. It is verified before it takes its place.
@@ -30,7 +30,7 @@ def publish(
         policy: policy checkpoint (.ckpt) to go with it
         task: name of the task to keep with it; without it the run's
         card: a text file for README.md; without it the run's own card
-        public: let everybody see a new repository on the hub
+        public: make a new repository on the Hub public
     """
     from dds_lightning.agent import DDSAgent
     from dds_lightning.saving.hub import is_hub, push
@@ -51,8 +51,8 @@ def publish(
         from dds_lightning.policy import PolicyModule
         from dds_lightning.skill import SkillModule
 
-        decides = None if policy is None else PolicyModule.load(policy)
-        agent = DDSAgent(SkillModule.load(skill), decides, "random" if decides is None else "sample")
+        chooser = None if policy is None else PolicyModule.load(policy)
+        agent = DDSAgent(SkillModule.load(skill), chooser, "random" if chooser is None else "sample")
         about, metrics = {"task": task}, None
     else:
         source = agent_directory(Path(run))
@@ -67,8 +67,8 @@ def publish(
         import tempfile
 
         with tempfile.TemporaryDirectory() as folder:
-            made = agent.save(Path(folder) / "agent", metrics=metrics, card=text, **about)
-            facts = {**verify_published(made), "directory": push(made, place, private=not public)}
+            saved = agent.save(Path(folder) / "agent", metrics=metrics, card=text, **about)
+            facts = {**verify_published(saved), "directory": push(saved, place, private=not public)}
     else:
         facts = verify_published(agent.save(place, metrics=metrics, card=text, **about))
     return Report(facts, [pairs(facts.items()), f'load it with DDSAgent.load("{place}")'])
@@ -89,9 +89,9 @@ def list_(root: list[str] = ["checkpoints", "runs"]) -> Report:  # noqa: B006 - 
 
 
 def verify(directory: str) -> Report:
-    """Look at everything in a published directory: hashes, header, shapes, finite numbers, known answers.
+    """Check everything in a published directory: hashes, header, shapes, finite numbers, known answers.
 
-    Ends with status 2 and what is wrong if it is not sound.
+    Ends with status 2, saying what is wrong, if it is not sound.
 
     Args:
         directory: as published, or hf:OWNER/NAME
@@ -100,7 +100,7 @@ def verify(directory: str) -> Report:
     from dds_lightning.sharing.verify import verify_published
 
     facts = verify_published(pull(directory) if is_hub(directory) else directory)
-    return Report(facts, [f"{directory} is sound: {_words(facts)}"])
+    return Report(facts, [f"{directory} is sound: {_summary(facts)}"])
 
 
 def export(
@@ -148,7 +148,7 @@ def export(
     return Report(data, [pairs({**facts, **describe(agent, task), **times}.items())])
 
 
-def _words(fact: dict[str, Any]) -> str:
+def _summary(fact: dict[str, Any]) -> str:
     golden = fact["golden"]
     answers = "it stores no answers to compare" if golden is None else f"answers as published (within {golden:.1g})"
     return f"task {fact['task']}, {fact['parameters']:,} parameters, {fact['num_skills']} skills; {answers}"

@@ -129,7 +129,7 @@ def export_agent(agent: DDSAgent, path: str | Path, format: Format = "onnx", *, 
             program = torch.export.export(graph, example, dynamic_shapes=shapes)
             torch.export.save(program, part, extra_files={FACTS: facts})
         else:
-            program = torch.onnx.export(
+            exported = torch.onnx.export(
                 graph,
                 example,
                 input_names=list(INPUTS),
@@ -138,9 +138,9 @@ def export_agent(agent: DDSAgent, path: str | Path, format: Format = "onnx", *, 
                 dynamo=True,
                 external_data=False,
             )
-            assert program is not None, "the dynamo exporter returns a program"
-            program.model.metadata_props[FACTS] = facts
-            program.save(part, external_data=False)
+            assert exported is not None, "the dynamo exporter returns a program"
+            exported.model.metadata_props[FACTS] = facts
+            exported.save(part, external_data=False)
     return path
 
 

@@ -1,4 +1,4 @@
-"""What a finished run found: everything a report tells, read back from the run's files."""
+"""What a finished run produced: everything that a report shows, read from the run's files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STAGES = ("data", "skill", "relabel", "policy", "clone", "evaluate")
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """Everything a report tells, read from one run directory.
+    """Everything that a report shows, read from one run directory.
 
     Attributes:
         root: The run directory.
@@ -49,8 +49,7 @@ class Findings:
         """Read a run directory.
 
         Raises:
-            UserError: It holds no evaluation, one of a task that this version does not know, or a stage of a newer
-                version.
+            UserError: The directory holds no evaluation, one of an unknown task, or a stage of a newer version.
         """
         if not (root / "evaluate" / "episodes.parquet").is_file():
             raise UserError(
@@ -83,7 +82,7 @@ class Findings:
         )
 
     def facts(self, stage: str) -> Mapping[str, Any]:
-        """What a stage's marker tells beside its files; empty where there is none."""
+        """Return the facts in a stage's marker; empty if there is none."""
         return self.markers.get(stage, {}).get("facts", {})
 
     @property

@@ -29,14 +29,14 @@ def protocol(
     checkpoint: str = LAST,
     best: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Everything a score depends on beside the weights.
+    """Return everything that a score depends on besides the weights.
 
     Args:
-        task: What is played, in its variant.
-        agent: Who plays.
-        episodes: Of each contestant.
-        seed: Of environments and agents.
-        temperature: Of sampled codes.
+        task: The task, in its variant.
+        agent: The agent that plays.
+        episodes: Episodes of each contestant.
+        seed: Seed of environments and agents.
+        temperature: Temperature of sampled codes.
         checkpoint: "last", "best" or "last and best".
         best: Facts of the best checkpoint, see `best_facts`, where it plays too.
 
@@ -66,12 +66,12 @@ def protocol(
 
 
 def full_name(task: Task) -> str:
-    """A task's name with its variant, as it can be typed."""
+    """Return a task's name with its variant, as it can be typed."""
     return f"{task.base_name}@{task.physics}" if task.physics else task.name
 
 
 def heading(facts: Mapping[str, Any]) -> str:
-    """A protocol as the one line above its table."""
+    """Return a protocol as the line above its table."""
     decoder = "decoder without noise"
     if facts["sampler"] is not None:
         decoder = f"decoder noise {facts['noise_scale']:g} ({facts['sampler']})"
@@ -83,12 +83,12 @@ def heading(facts: Mapping[str, Any]) -> str:
 
 
 def paper_line(task: Task) -> str | None:
-    """What the paper reports for a task and why it may not be comparable; None where it reports nothing."""
+    """Return what the paper reports for a task and why it may not be comparable; None where it reports nothing."""
     return None if task.paper_score is None else f"The paper reports {task.paper_score:.1f}, {PAPERS_DATA}."
 
 
 def best_facts(last: Path, best: Path) -> dict[str, Any]:
-    """How a training chose its best checkpoint, read from its two files.
+    """Return how a training chose its best checkpoint, read from its two files.
 
     Args:
         last: The training's last checkpoint; it has the history of all evaluations.
@@ -120,7 +120,7 @@ def best_facts(last: Path, best: Path) -> dict[str, Any]:
 
 
 def start_value(task: Task, agent: DDSAgent, seed: int, episodes: int = 10) -> dict[str, float] | None:
-    """What the critic promises where episodes start, in discounted learning rewards.
+    """Return the critic's value where episodes start, in discounted learning rewards.
 
     Returns:
         `mean` of V over the starts of some evaluation episodes, and `low` and `high`, what rewards and discounts

@@ -1,4 +1,4 @@
-"""`dds atlas`: what a place holds (a run, a published agent, a skill checkpoint), and the skill atlas of it."""
+"""`dds atlas`: what a path holds (a run, a published agent, a skill checkpoint), and its skill atlas."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Subject:
         task: Name of the task; None where nothing says it.
         data: Where the data are, `SOURCE:NAME`; None where nothing says it.
         found: The evaluation of a finished run; None elsewhere.
-        about: What it is, in words.
+        about: A description.
     """
 
     agent: DDSAgent
@@ -45,14 +45,14 @@ class Subject:
 
 
 def find_subject(place: Path, seed: int = 0) -> Subject:
-    """Look at a place.
+    """Find out what a path holds.
 
     Args:
         place: A run of `dds run` that has learnt its skills at least, a published directory, or a skill checkpoint.
-        seed: Of the agent.
+        seed: Seed of the agent.
 
     Raises:
-        UserError: It is none of these.
+        UserError: The path holds none of these.
     """
     if place.is_file() or place.suffix == ".ckpt":
         return Subject(_skills_alone(place, seed), None, None, None, f"skill checkpoint {place}")
@@ -80,7 +80,7 @@ def _skills_alone(checkpoint: Path, seed: int) -> DDSAgent:
 
 
 def _data_of(run: Path) -> tuple[str | None, str | None]:
-    """Data and task of a run; nothing of what is no run."""
+    """Return data and task of a run; None for what is not a run."""
     marker = read_marker(run / "data")
     settings = marker.get("settings", {})
     collected = marker.get("outputs", {}).get("data")
@@ -98,7 +98,7 @@ def atlas(
     figures: Path | None = None,
     tell: Tell = lambda words: None,
 ) -> tuple[Atlas, Path]:
-    """Make and write the atlas of a place; the arguments are those of `dds atlas`.
+    """Create and write the atlas of a path; the arguments are those of `dds atlas`.
 
     Raises:
         UserError: No skills there, no data or no task known, or they do not fit each other.
@@ -123,18 +123,18 @@ def atlas(
     result, main, singles = _episodes(subject, wanted, episodes, seed, tell)
     others = [(DISCRETE if model.discrete else CONTINUOUS, model) for model in models]
     made = make_atlas(subject.agent, wanted, trajectories, result, main, singles, others=others, seed=seed, tell=tell)
-    words = ["dds", "atlas", str(place), "--data", spec, "--task", wanted.name, "--seed", str(seed)]
+    command = ["dds", "atlas", str(place), "--data", spec, "--task", wanted.name, "--seed", str(seed)]
     tell("writing the page")
     if figures is not None:
         write_pictures(made, figures, out.stem)
     about = _about(subject, wanted, spec, result, main)
-    return made, write_atlas(made, out, about, shlex.join([*words, "--out", str(out)]))
+    return made, write_atlas(made, out, about, shlex.join([*command, "--out", str(out)]))
 
 
 def _episodes(
     subject: Subject, task: Task, episodes: int, seed: int, tell: Tell
 ) -> tuple[RolloutResult | None, str | None, str | None]:
-    """Episodes with their paths, the policy's name and the single skills': a run's own, or played now."""
+    """Return episodes with their paths, and the names of policy and single skills: the run's, or played now."""
     found = subject.found
     if found is not None and found.task == task and found.result.paths:
         return found.result, found.main, found.singles

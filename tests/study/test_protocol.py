@@ -11,7 +11,7 @@ from dds_lightning.callbacks.rollouts import RolloutEvaluation
 from dds_lightning.errors import UserError
 from dds_lightning.policy import PolicyModule
 from dds_lightning.skill import SkillModule
-from dds_lightning.study.contestants import best_ways, best_words
+from dds_lightning.study.contestants import best_label, best_ways
 from dds_lightning.study.protocol import best_facts, full_name, heading, paper_line, protocol, start_value
 from dds_lightning.tasks import get_task
 
@@ -81,9 +81,9 @@ def test_how_the_best_was_chosen_is_read_from_its_files(tmp_path, key):
     with pytest.raises(UserError, match="was not kept as a best checkpoint"):
         best_facts(tmp_path / "last.ckpt", tmp_path / "other.ckpt")
     assert facts == {"monitor": "rollout/score", "value": 30.0, "step": 10, "evaluations": 2}
-    assert best_words(facts) == "best of 2 evaluations while training, step 10: optimistic"
+    assert best_label(facts) == "best of 2 evaluations while training, step 10: optimistic"
     assert (
-        best_words({**facts, "monitor": "val/q_loss", "evaluations": None}) == "best val/q_loss while training, step 10"
+        best_label({**facts, "monitor": "val/q_loss", "evaluations": None}) == "best val/q_loss while training, step 10"
     )
     ways = best_ways(agent(get_task("hopper-medium")), 3, facts)
     assert [way.name.partition(" (")[0] for way in ways] == ["AWR policy, sampled", "AWR policy, greedy"]
