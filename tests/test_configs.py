@@ -18,6 +18,7 @@ from dds_lightning.errors import UserError
 from dds_lightning.pipeline.settings import RunSettings
 from dds_lightning.tasks import get_task, task_names
 from dds_lightning.training.stage_cli import settings_of
+from dds_lightning.training.stages import presets
 
 
 def _flat(value, prefix=""):
@@ -38,7 +39,11 @@ def test_every_packaged_configuration_parses_and_nothing_in_it_is_lost(name):
 
 def test_every_family_of_tasks_has_a_preset_and_so_has_the_paper():
     for family in {get_task(name).family for name in task_names()} | {"paper"}:
-        assert {path.name for path in find_preset(family).values()} == {"skill.yaml", "policy.yaml"}
+        assert {path.name for path in find_preset(family, presets()).values()} == {
+            "skill.yaml",
+            "policy.yaml",
+            "clone.yaml",
+        }
 
 
 def test_the_papers_skill_settings_are_tables_4_to_6():
@@ -86,13 +91,13 @@ def test_an_unknown_configuration_or_preset_lists_the_packaged_ones(tmp_path):
     with pytest.raises(UserError, match=r"no file nope.yaml.*paper/skill.yaml"):
         find("nope.yaml")
     with pytest.raises(UserError, match=r"no folder nope.*paper, pointmaze"):
-        find_preset("nope")
+        find_preset("nope", presets())
     with pytest.raises(UserError, match=r"has no skill.yaml"):
-        find_preset(str(tmp_path))
+        find_preset(str(tmp_path), presets())
 
 
 def test_a_presets_run_fills_in_what_was_not_asked_for(tmp_path):
-    for stage, path in find_preset("pointmaze").items():
+    for stage, path in find_preset("pointmaze", presets()).items():
         (tmp_path / f"{stage}.yaml").write_text(path.read_text())
     assert run_defaults(str(tmp_path)) == RUN_DEFAULTS
     (tmp_path / "run.yaml").write_text("data_steps: 1000\ntemperature: 1\nselection: greedy\n")
@@ -121,7 +126,12 @@ def test_a_run_tells_the_command_that_makes_it_again():
     plain = RunSettings.with_preset("hopper-medium", Path("out"))
     assert plain.command() == "dds run hopper-medium --seed=0"
     asked = RunSettings.with_preset(
-        "hopper-medium", Path("out"), seed=3, data_steps=5000, noise_scale=0.25, policy=("--model.alpha=10",)
+        "hopper-medium",
+        Path("out"),
+        seed=3,
+        data_steps=5000,
+        noise_scale=0.25,
+        stages={"policy": ("--model.alpha=10",)},
     )
     assert asked.command() == (
         "dds run hopper-medium --seed=3 --data_steps=5000 --noise_scale=0.25 --policy.model.alpha=10"

@@ -1,6 +1,6 @@
 """The packaged configurations and how a command line finds them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,18 +36,29 @@ def find(name: str) -> Path:
     raise UserError(f"--config: there is no file {name}, and the packaged ones are {', '.join(packaged())}")
 
 
-def find_preset(name: str) -> dict[str, Path]:
-    """Both configurations of a preset: a packaged folder's name or a folder of the user's.
+def find_preset(name: str, stages: Mapping[str, str | None]) -> dict[str, Path]:
+    """The configurations of a preset: a packaged folder's name or a folder of the user's.
+
+    Args:
+        name: Of the preset.
+        stages: Stage -> the packaged configuration to use where the folder has no `STAGE.yaml`; None where it must.
+
+    Returns:
+        Stage -> file.
 
     Raises:
-        UserError: neither exists, or one of the two files is missing.
+        UserError: There is no such preset, or it lacks a file.
     """
     folder = _preset_folder(name)
-    pair = {stage: folder / f"{stage}.yaml" for stage in ("skill", "policy")}
-    for path in pair.values():
+    files = {}
+    for stage, general in stages.items():
+        path = folder / f"{stage}.yaml"
         if not path.is_file():
-            raise UserError(f"preset: folder {folder} has no {path.name}")
-    return pair
+            if general is None:
+                raise UserError(f"preset: folder {folder} has no {path.name}")
+            path = ROOT / general
+        files[stage] = path
+    return files
 
 
 def run_defaults(name: str) -> dict[str, Any]:
@@ -83,7 +94,7 @@ def run_defaults(name: str) -> dict[str, Any]:
 def _preset_folder(name: str) -> Path:
     folder = Path(name) if Path(name).is_dir() else ROOT / name
     if not folder.is_dir():
-        known = ", ".join(sorted({Path(entry).parent.name for entry in packaged()}))
+        known = ", ".join(sorted({Path(entry).parent.name for entry in packaged() if "/" in entry}))
         raise UserError(f"preset: there is no folder {name}, and the packaged ones are {known}")
     return folder
 

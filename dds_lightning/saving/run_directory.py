@@ -20,7 +20,7 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -59,7 +59,7 @@ class Done:
     skipped: bool = False
 
 
-class Stages:
+class RunDirectory:
     """The stages of one run directory.
 
     Args:
@@ -72,7 +72,15 @@ class Stages:
         self.root, self.console, self.fresh = root, console, fresh
         self.done: list[Done] = []
 
-    def do(self, name: str, title: str, settings: Mapping[str, Any], reads: list[Done], work: Work) -> Done:
+    def do(
+        self,
+        name: str,
+        title: str,
+        settings: Mapping[str, Any],
+        reads: Sequence[Done],
+        work: Work,
+        former: Mapping[str, Any] | None = None,
+    ) -> Done:
         """Do one stage, or find it done.
 
         Args:
@@ -82,6 +90,7 @@ class Stages:
             reads: the stages whose outputs it uses.
             work: called with (folder, resuming); returns outputs (values that are paths in the folder) and
                 facts.
+            former: `settings` as an earlier version wrote them, which are taken for the same.
 
         Raises:
             UserError: a newer version of this package did the stage; nothing is touched.
@@ -89,7 +98,8 @@ class Stages:
         folder = self.root / name
         expected = {"settings": _json(settings), "inputs": {stage.name: stage.digest for stage in reads}}
         marker = read_marker(folder)
-        same = {key: marker.get(key) for key in expected} == expected
+        there = {key: marker.get(key) for key in expected}
+        same = there in (expected, {**expected, "settings": _json(settings if former is None else former)})
         if same and marker.get("state") == "finished" and not self.fresh and (found := _found(folder, marker)):
             self._say(f"{title}: done before, in {duration(found.seconds)}", "dim")
             self.done.append(found)

@@ -20,7 +20,7 @@ from dds_lightning.saving.checkpoint import AtomicCheckpointIO
 from dds_lightning.training.progress import StepProgress
 
 
-class KeptSettings(Callback):
+class TrainingSettings(Callback):
     """Keep in every checkpoint how its training was asked for, so that a contradiction is noticed on resuming.
 
     Args:

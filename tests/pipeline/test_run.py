@@ -229,10 +229,10 @@ def test_a_run_without_a_best_says_so(finished, capsys):
     ],
 )
 def test_the_policy_is_evaluated_four_times_except_where_the_maze_is_easy(task, every, steps, found):
-    wanted = RunSettings(task, Path("out"), evaluate_every=every, policy=(f"--trainer.max_steps={steps}",))
+    wanted = RunSettings(task, Path("out"), evaluate_every=every, stages={"policy": (f"--trainer.max_steps={steps}",)})
     trainings = Trainings(wanted, get_task(task))
     assert trainings.evaluate_every == found
-    settings = trainings.settings["policy"]
+    settings = trainings.settings("policy")
     assert settings["best"]["monitor"] == ("rollout/score" if found else None)
     assert settings["best"]["every_n_steps"] == (found or None)
     callbacks = [callback["init_args"] for callback in settings["trainer"]["callbacks"] or []]
@@ -240,8 +240,11 @@ def test_the_policy_is_evaluated_four_times_except_where_the_maze_is_easy(task, 
         [(found, 10, 1)] if found else []
     )
     other = Trainings(dataclasses.replace(wanted, workers=3), get_task(task))
-    assert other.essence("policy") == trainings.essence("policy")
-    assert set(trainings.essence("skill")["best"]) == {"monitor", "mode"}  # runs of earlier versions are still done
+    assert other.cache_key_settings("policy") == trainings.cache_key_settings("policy")
+    assert set(trainings.cache_key_settings("skill")["best"]) == {
+        "monitor",
+        "mode",
+    }  # runs of earlier versions are still done
 
 
 @pytest.mark.parametrize("every", [-1, 21])
