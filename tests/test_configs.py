@@ -9,7 +9,6 @@ from dds_lightning.configs import (
     ROOT,
     RUN_DEFAULTS,
     find,
-    find_preset,
     packaged,
     resolve_configs,
     run_defaults,
@@ -18,7 +17,7 @@ from dds_lightning.errors import UserError
 from dds_lightning.pipeline.settings import RunSettings
 from dds_lightning.tasks import get_task, task_names
 from dds_lightning.training.stage_cli import settings_of
-from dds_lightning.training.stages import presets
+from dds_lightning.training.stages import preset_configs
 
 
 def _flat(value, prefix=""):
@@ -39,7 +38,7 @@ def test_every_packaged_configuration_parses_and_nothing_in_it_is_lost(name):
 
 def test_every_family_of_tasks_has_a_preset_and_so_has_the_paper():
     for family in {get_task(name).family for name in task_names()} | {"paper"}:
-        assert {path.name for path in find_preset(family, presets()).values()} == {
+        assert {path.name for path in preset_configs(family).values()} == {
             "skill.yaml",
             "policy.yaml",
             "clone.yaml",
@@ -69,6 +68,13 @@ def test_the_papers_policy_settings_are_table_7():
     assert settings["trainer"]["max_steps"] - model["critic_steps"] == 500_000
 
 
+@pytest.mark.parametrize("stage", ["skill", "clone"])
+def test_the_split_and_the_order_of_data_follow_the_seed_unless_they_have_their_own(stage):
+    assert settings_of(stage, ["fit"])["data"]["seed"] == 0
+    assert settings_of(stage, ["fit", "--seed_everything=5"])["data"]["seed"] == 5
+    assert settings_of(stage, ["fit", "--seed_everything=5", "--data.seed=2"])["data"]["seed"] == 2
+
+
 def test_a_packaged_name_is_found_with_and_without_its_ending():
     assert find("pointmaze/skill") == find("pointmaze/skill.yaml") == ROOT / "pointmaze" / "skill.yaml"
 
@@ -91,13 +97,13 @@ def test_an_unknown_configuration_or_preset_lists_the_packaged_ones(tmp_path):
     with pytest.raises(UserError, match=r"no file nope.yaml.*paper/skill.yaml"):
         find("nope.yaml")
     with pytest.raises(UserError, match=r"no folder nope.*paper, pointmaze"):
-        find_preset("nope", presets())
+        preset_configs("nope")
     with pytest.raises(UserError, match=r"has no skill.yaml"):
-        find_preset(str(tmp_path), presets())
+        preset_configs(str(tmp_path))
 
 
 def test_a_presets_run_fills_in_what_was_not_asked_for(tmp_path):
-    for stage, path in find_preset("pointmaze", presets()).items():
+    for stage, path in preset_configs("pointmaze").items():
         (tmp_path / f"{stage}.yaml").write_text(path.read_text())
     assert run_defaults(str(tmp_path)) == RUN_DEFAULTS
     (tmp_path / "run.yaml").write_text("data_steps: 1000\ntemperature: 1\nselection: greedy\n")

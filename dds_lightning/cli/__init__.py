@@ -78,10 +78,10 @@ def _dispatch(words: list[str]) -> int:
 
 def _path(words: list[str]) -> list[str]:
     """The words that name a command: as many of the first as there are."""
-    from dds_lightning.cli.parser import COMMANDS
+    from dds_lightning.cli.parser import command_table
 
     path: list[str] = []
-    table: Any = COMMANDS
+    table: Any = command_table()
     for word in words:
         if not isinstance(table, Mapping) or word not in table:
             break

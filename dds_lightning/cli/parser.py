@@ -13,25 +13,6 @@ from dds_lightning.training.stages import STAGES
 
 Commands = Mapping[str, Any]  # name -> function, a group of commands, or None for one of Lightning's
 
-COMMANDS: Commands = {
-    "run": commands.run,
-    **dict.fromkeys(STAGES),
-    "relabel": commands.relabel,
-    "evaluate": commands.evaluate,
-    "report": commands.report,
-    "atlas": atlas.atlas,
-    "data": {
-        "list": data.list_,
-        "show": data.show,
-        "check": commands.data_check,
-        "fetch": data.fetch,
-        "collect": data.collect,
-    },
-    "tasks": commands.tasks,
-    "publish": checkpoints.publish,
-    "checkpoints": {"list": checkpoints.list_, "verify": checkpoints.verify},
-    "export": checkpoints.export,
-}
 GROUPS = {
     "data": "List, show, check, fetch and collect data sets.",
     "checkpoints": "List and verify published agents.",
@@ -40,6 +21,29 @@ OPTIONAL_WORDS = {commands.tasks: "name"}
 """Functions with a parameter that has a default and is typed without its name all the same."""
 TAKES_STAGES = (commands.run,)
 """Functions that take the arguments of each training stage as a keyword of its name."""
+
+
+def command_table() -> Commands:
+    """The commands by their names, in the order in which the help lists them."""
+    return {
+        "run": commands.run,
+        **dict.fromkeys(STAGES),
+        "relabel": commands.relabel,
+        "evaluate": commands.evaluate,
+        "report": commands.report,
+        "atlas": atlas.atlas,
+        "data": {
+            "list": data.list_,
+            "show": data.show,
+            "check": commands.data_check,
+            "fetch": data.fetch,
+            "collect": data.collect,
+        },
+        "tasks": commands.tasks,
+        "publish": checkpoints.publish,
+        "checkpoints": {"list": checkpoints.list_, "verify": checkpoints.verify},
+        "export": checkpoints.export,
+    }
 
 
 def build_parser() -> tuple[ArgumentParser, dict[str, Callable[..., Any]]]:
@@ -51,7 +55,7 @@ def build_parser() -> tuple[ArgumentParser, dict[str, Callable[..., Any]]]:
         exit_on_error=False,
     )
     functions: dict[str, Callable[..., Any]] = {}
-    _add(parser, COMMANDS, functions)
+    _add(parser, command_table(), functions)
     return parser, functions
 
 
@@ -106,7 +110,7 @@ def prepare(words: list[str]) -> list[str]:
     """
     flags = {
         f"--{name}"
-        for function in _functions(COMMANDS)
+        for function in _functions(command_table())
         for name, parameter in inspect.signature(function).parameters.items()
         if parameter.default is False
     }

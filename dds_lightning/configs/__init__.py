@@ -1,6 +1,6 @@
 """The packaged configurations and how a command line finds them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,36 +36,11 @@ def find(name: str) -> Path:
     raise UserError(f"--config: there is no file {name}, and the packaged ones are {', '.join(packaged())}")
 
 
-def find_preset(name: str, stages: Mapping[str, str | None]) -> dict[str, Path]:
-    """The configurations of a preset: a packaged folder's name or a folder of the user's.
-
-    Args:
-        name: Of the preset.
-        stages: Stage -> the packaged configuration to use where the folder has no `STAGE.yaml`; None where it must.
-
-    Returns:
-        Stage -> file.
-
-    Raises:
-        UserError: There is no such preset, or it lacks a file.
-    """
-    folder = _preset_folder(name)
-    files = {}
-    for stage, general in stages.items():
-        path = folder / f"{stage}.yaml"
-        if not path.is_file():
-            if general is None:
-                raise UserError(f"preset: folder {folder} has no {path.name}")
-            path = ROOT / general
-        files[stage] = path
-    return files
-
-
 def run_defaults(name: str) -> dict[str, Any]:
     """What a preset says about `dds run` beside its two trainings; the file `run.yaml` may be missing.
 
     Args:
-        name: as for `find_preset`.
+        name: as for `preset_folder`.
 
     Returns:
         A value for each of `RUN_DEFAULTS`.
@@ -73,7 +48,7 @@ def run_defaults(name: str) -> dict[str, Any]:
     Raises:
         UserError: there is no such preset, or its `run.yaml` holds something else.
     """
-    path = _preset_folder(name) / "run.yaml"
+    path = preset_folder(name) / "run.yaml"
     try:
         chosen = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else {}
     except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -91,7 +66,12 @@ def run_defaults(name: str) -> dict[str, Any]:
     return {**RUN_DEFAULTS, **chosen}
 
 
-def _preset_folder(name: str) -> Path:
+def preset_folder(name: str) -> Path:
+    """The folder of a preset: a packaged one's name or a folder of the user's.
+
+    Raises:
+        UserError: There is none.
+    """
     folder = Path(name) if Path(name).is_dir() else ROOT / name
     if not folder.is_dir():
         known = ", ".join(sorted({Path(entry).parent.name for entry in packaged() if "/" in entry}))

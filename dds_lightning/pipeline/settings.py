@@ -9,12 +9,12 @@ from typing import Any
 
 from jsonargparse import Namespace
 
-from dds_lightning.configs import RUN_DEFAULTS, find_preset, run_defaults
+from dds_lightning.configs import RUN_DEFAULTS, run_defaults
 from dds_lightning.console.reports import Report
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import Task, get_task
 from dds_lightning.training.stage_cli import StageCLI, command_line, parsed
-from dds_lightning.training.stages import STAGES, presets
+from dds_lightning.training.stages import STAGES, preset_configs
 
 WATCH_EPISODES = 10
 """Episodes of each evaluation while the policy trains."""
@@ -89,7 +89,7 @@ class Trainings:
 
     def __init__(self, wanted: RunSettings, task: Task) -> None:
         self.wanted, self.task = wanted, task
-        self.preset = find_preset(wanted.preset or task.family, presets())
+        self.preset = preset_configs(wanted.preset or task.family)
         # How often the policy is evaluated follows from its steps, which only its parsed settings say.
         self.evaluate_every = self._asked_interval()
         spec = wanted.data or "local:."
@@ -155,7 +155,8 @@ class Trainings:
             skill: Checkpoint of the skills, for the policy; None stands for where it will be.
         """
         wanted, folder = self.wanted, self.wanted.out / stage
-        arguments = ["fit", "--config", str(self.preset[stage])]
+        config = self.preset[stage]
+        arguments = ["fit", *(["--config", str(config)] if config else [])]
         arguments += [f"--seed_everything={wanted.seed}", f"--data.seed={wanted.seed}"]
         arguments += [f"--data.task={self.task.name}", f"--data.data={spec}"]
         if stage == "policy":

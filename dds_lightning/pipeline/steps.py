@@ -94,7 +94,7 @@ def _data(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
 # ---------------------------------------------------------------------- trainings
 
 
-def _training(stage: str, reads: tuple[str, ...], title: Callable[[Run, Settings], str], best: str = "") -> Step:
+def training_step(stage: str, reads: tuple[str, ...], title: Callable[[Run, Settings], str], best: str = "") -> Step:
     """The step that trains a stage.
 
     Args:
@@ -245,7 +245,7 @@ STEPS: dict[str, Step] = {
     step.name: step
     for step in (
         Step("data", (), _data_title, _data_settings, _data),
-        _training("skill", ("data",), _skill_title, best="replaces"),
+        training_step("skill", ("data",), _skill_title, best="replaces"),
         Step(
             "relabel",
             ("data", "skill"),
@@ -253,13 +253,13 @@ STEPS: dict[str, Step] = {
             lambda run: {"task": run.task.name, **run.trainings.relabelling()},
             _relabel,
         ),
-        _training(
+        training_step(
             "policy",
             ("data", "skill", "relabel"),
             lambda run, settings: f"policy: {settings['trainer']['max_steps']:,} steps",
             best="beside",
         ),
-        _training(
+        training_step(
             "clone",
             ("data",),
             lambda run, settings: f"clone: behaviour cloning, the baseline, {run.wanted.clone_steps:,} steps",

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dds_lightning.configs import find, preset_folder
 from dds_lightning.errors import UserError
 
 if TYPE_CHECKING:
@@ -30,7 +32,8 @@ class Stage:
         links: Attributes of the data that become settings of the module; never the user's to give.
         steps: Optimiser steps without a configuration.
         widths: The settings that take memory beside `data.batch_size`, for advice.
-        preset: Packaged configuration for presets that have no `NAME.yaml` of their own; None where each must have one.
+        in_presets: Whether every preset folder must have a `NAME.yaml` for it.
+        preset: Packaged configuration where a preset folder has none; None takes the module's defaults.
         threads: Threads of torch while fitting; None leaves torch's own number.
     """
 
@@ -41,6 +44,7 @@ class Stage:
     links: tuple[str, ...]
     steps: int
     widths: str
+    in_presets: bool = False
     preset: str | None = None
     threads: int | None = None
 
@@ -64,6 +68,7 @@ STAGES: dict[str, Stage] = {
             links=("observation_dim", "action_dim", "horizon"),
             steps=500_000,  # the paper's, as are the defaults of the module
             widths="data.horizon or model.hidden_dim",
+            in_presets=True,
         ),
         Stage(
             name="policy",
@@ -73,6 +78,7 @@ STAGES: dict[str, Stage] = {
             links=("observation_dim", "num_skills", "skill_hash"),
             steps=1_500_000,
             widths="model.hidden_dims",
+            in_presets=True,
         ),
         Stage(
             name="clone",
@@ -90,9 +96,29 @@ STAGES: dict[str, Stage] = {
 """Name -> stage, in the order of the method."""
 
 
-def presets() -> dict[str, str | None]:
-    """Stage -> its packaged configuration for presets that have none, see `configs.find_preset`."""
-    return {name: stage.preset for name, stage in STAGES.items()}
+def preset_configs(name: str) -> dict[str, Path | None]:
+    """The configuration of every stage in a preset.
+
+    Args:
+        name: A packaged folder's name or a folder of the user's.
+
+    Returns:
+        Stage -> file; None where the module's defaults hold.
+
+    Raises:
+        UserError: There is no such preset, or it lacks the file of a stage that must be in it.
+    """
+    folder = preset_folder(name)
+    files: dict[str, Path | None] = {}
+    for stage in STAGES.values():
+        path = folder / f"{stage.name}.yaml"
+        if path.is_file():
+            files[stage.name] = path
+        elif stage.in_presets:
+            raise UserError(f"preset: folder {folder} has no {path.name}")
+        else:
+            files[stage.name] = find(stage.preset) if stage.preset else None
+    return files
 
 
 def get_stage(name: str) -> Stage:
