@@ -118,11 +118,11 @@ def test_a_presets_run_fills_in_what_was_not_asked_for(tmp_path):
     [
         ("steps: 3", "run.yaml sets steps, expected only data_steps, clone_steps, selection, temperature"),
         ("data_steps: many", "run.yaml sets data_steps to 'many', expected a value like 200000"),
-        ("- 3", "run.yaml holds no settings"),
-        ("selection: [greedy", "run.yaml is no YAML: while parsing a flow sequence"),
+        ("- 3", "run.yaml is not a mapping"),
+        ("selection: [greedy", "run.yaml is not valid YAML: while parsing a flow sequence"),
     ],
 )
-def test_a_presets_run_that_is_none_is_refused(tmp_path, text, message):
+def test_a_presets_run_file_that_is_malformed_is_refused(tmp_path, text, message):
     (tmp_path / "run.yaml").write_text(text)
     with pytest.raises(UserError, match=message):
         run_defaults(str(tmp_path))
