@@ -286,7 +286,7 @@ def test_what_an_earlier_version_finished_is_still_done(finished, capsys, tmp_pa
         (out / name / "stage.json").write_text(json.dumps(marker))
     _, said, _ = call(capsys, *given)
     assert said["done_before"] == STAGES[:5]
-    _, said, err = call(capsys, *given, "--clone.model.lr=0.01")
+    _, said, _ = call(capsys, *given, "--clone.model.lr=0.01")
     assert said["done_before"] == STAGES[:4]
 
 
