@@ -46,7 +46,7 @@ MOVED = {
     "datamodules.resimulate": "datamodules.physics.resimulate",
     "datamodules.sources.states": "datamodules.physics.states",
     "datamodules.sources.recordings": "datamodules.sources.rows",
-    "datamodules.signature": "datamodules.sources",
+    "datamodules.signature": "datamodules.sources.stat_hash",
     "datamodules.sources.belonging": "datamodules.sources.plausibility",
     "dds_lightning.optim": "dds_lightning.module",
     **{f"dds_lightning.interpret.{name}": f"dds_lightning.interpret.draw.{name}" for name in _DRAW},

@@ -18,8 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.sources import open_rows
-from datamodules.sources.rows import Recording
+from datamodules.sources.rows import Recording, open_recording
 from datamodules.validation import DataError
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import Task
@@ -136,7 +135,7 @@ def draw_steps(spec: str, task: Task, count: int, seed: int = 0) -> RecordedStep
     if count < 1:
         raise UserError(f"steps to replay: found {count}, expected at least 1")
     rng = np.random.default_rng(seed)
-    with open_rows(spec, task, rng) as recording:
+    with open_recording(spec, task, rng) as recording:
         return _draw(recording, task, count, rng)
 
 

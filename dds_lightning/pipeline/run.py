@@ -65,9 +65,10 @@ class Run:
 
             refuse_uncollectable(self.task)
             return None
-        from datamodules.sources import resolve_task, stat_hash
+        from datamodules.sources import resolve_task
+        from datamodules.sources.stat_hash import signature
 
-        files = stat_hash(spec)
+        files = signature(spec)
         self.task = resolve_task(spec, self.task)
         return files
 
