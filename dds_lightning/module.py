@@ -13,9 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from dds_lightning.errors import UserError
-from dds_lightning.finetune import read, start_from
-from dds_lightning.nn.normaliser import Normaliser
-from dds_lightning.saving.checkpoint import load_module
+from dds_lightning.finetune import read, refuse_other_box, start_from
+from dds_lightning.nn.normaliser import ActionBox, Normaliser
+from dds_lightning.saving.checkpoint import STAGE_KEY, load_module
 
 Schedule = Literal["constant", "cosine"]
 
@@ -30,15 +30,18 @@ class StageModule(pl.LightningModule):
 
     hparams: Any  # Lightning gives its settings as attributes, but types them as a mapping
     STAGE: ClassVar[str]
-    """Name of the module in a published directory."""
+    """Name of its training stage, in every checkpoint, and of the module in a published directory."""
     PARTS: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     """What can be frozen or slowed down, and the submodules that belong to it."""
     SHAPE: ClassVar[tuple[str, ...]] = ()
     """Settings in which a checkpoint to start from must agree."""
+    PREDICTION: ClassVar[str] = "code"
+    """What `predict_step` returns one of for each row."""
     OF_DATA: ClassVar[tuple[str, ...]] = ()
     """Buffers that always come from the data."""
 
     normaliser: Normaliser
+    action_box: ActionBox  # of modules that see actions
     init_from: str | None = None  # the checkpoint this module started from, in this process
     terms: Mapping[str, Tensor] = MappingProxyType({})  # of the last training step; `FiniteGuard` names the bad ones
 
@@ -113,6 +116,10 @@ class StageModule(pl.LightningModule):
     def after_step(self, step: int) -> None:
         """Update what depends on optimiser step `step`, counted from 1."""
 
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Say whose checkpoint it is."""
+        checkpoint[STAGE_KEY] = self.STAGE
+
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Forget `init_from`: a training that continues does not start from weights."""
         self.init_from = None
@@ -145,6 +152,21 @@ class StageModule(pl.LightningModule):
         if missing := [name for name in names if name not in statistics]:
             raise UserError(f"{type(datamodule).__name__}.statistics() lacks {', '.join(missing)}: return these too")
         return {name: statistics[name] for name in names}
+
+    def fit_units(self) -> None:
+        """Take the statistics of observations and actions from the data, unless a checkpoint brought them.
+
+        Raises:
+            UserError: There are none, or the data's actions have other bounds than those of the checkpoint.
+        """
+        if bool(self.normaliser.fitted):
+            refuse_other_box(self, getattr(self.trainer, "datamodule", None))
+            return
+        names = ("observation_mean", "observation_std", "action_low", "action_high")
+        remedy = "fit it with a SegmentDataModule, or call normaliser.fit(mean, std) and action_box.fit(low, high)"
+        mean, std, low, high = self.data_statistics(names, remedy).values()
+        self.normaliser.fit(mean, std)
+        self.action_box.fit(low, high)
 
     def log_training(self, total: Tensor, more: Callable[[], Mapping[str, Tensor]] = dict) -> None:
         """Log a training step's loss and terms, at the steps of `is_log_step`.

@@ -16,7 +16,6 @@ from torch import Tensor
 from torchmetrics import MeanMetric
 
 from dds_lightning.errors import UserError
-from dds_lightning.finetune import refuse_other_box
 from dds_lightning.module import StageModule
 from dds_lightning.nn.bottleneck import Bottleneck, Skill
 from dds_lightning.nn.codebook import Codebook, CodebookInit
@@ -29,8 +28,6 @@ from dds_lightning.nn.usage import CodebookUsage
 START_BATCHES = 64
 """Batches whose encodings start the codebook by k-means."""
 BOTTLENECKS: dict[str, type[Bottleneck]] = {"vq": Codebook, "gaussian": GaussianBottleneck}
-STATISTICS = ("observation_mean", "observation_std", "action_low", "action_high")
-"""What a data module's `statistics()` must provide."""
 Batch = dict[str, Tensor]
 
 
@@ -255,17 +252,11 @@ class SkillModule(StageModule):
     def on_fit_start(self) -> None:
         """Take the data's statistics and start the bottleneck, unless a checkpoint brought both."""
         self.refuse_frozen_without_weights()
-        datamodule: Any = getattr(self.trainer, "datamodule", None)
-        if bool(self.normaliser.fitted):
-            refuse_other_box(self, datamodule)
-        else:
-            remedy = "fit it with a SegmentDataModule, or call normaliser.fit(mean, std) and action_box.fit(low, high)"
-            mean, std, low, high = self.data_statistics(STATISTICS, remedy).values()
-            self.normaliser.fit(mean, std)
-            self.action_box.fit(low, high)
+        self.fit_units()
 
         def first() -> Tensor:
             # A separate loader: reading data here must not move the training's position.
+            datamodule: Any = getattr(self.trainer, "datamodule", None)
             loader: Any = datamodule.train_dataloader() if datamodule else self.trainer.train_dataloader
             return self._encodings_of(islice(iter(loader), START_BATCHES))
 

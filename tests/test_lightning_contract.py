@@ -36,7 +36,6 @@ CONTRACT = [
     Private(ModelCheckpoint, "_every_n_train_steps", "callbacks/rollouts.py", None),
     Private(LightningCLI, "_parse_ckpt_path", "training/stage_cli.py", ()),
     Private(LightningCLI, "_set_seed", "training/stage_cli.py", ()),
-    Private(LightningCLI, "_get", "training/stage_cli.py", ("config", "key", "default")),
     Private(LightningCLI, "_parser", "training/stage_cli.py", ("subcommand",)),
     Private(LightningCLI, "_instantiate_trainer", "training/stage_cli.py", ("config", "callbacks")),
     Private(LightningCLI, "_run_subcommand", "training/stage_cli.py", ("subcommand",)),
