@@ -1,8 +1,8 @@
 """One row a robot: what its observations and actions hold, and how they relate to the simulator's state.
 
 A new robot is a row of `BODIES` and, for pictures, one of `interpret.views.VIEWS`; a task's robot is the first word of
-its name, unless it says another. A robot without a row trains and acts all the same; its columns then have no names, and
-what needs the simulator's state is refused.
+its name, unless it says another. A robot without a row trains and acts all the same; its columns then have no names,
+and what needs the simulator's state is refused.
 
 Names of columns follow the joints and motors of the MuJoCo models, in the models' order; a test compares the two.
 """
