@@ -31,7 +31,7 @@ MOVED = {
     "dds_lightning.export": "dds_lightning.sharing.export",
     "dds_lightning.verification": "dds_lightning.sharing.verify",
     "dds_lightning.envs.adapters": "dds_lightning.tasks.env",
-    "dds_lightning.tasks.layout": "dds_lightning.tasks.columns",
+    "dds_lightning.tasks.layout": "dds_lightning.tasks.bodies",
     "dds_lightning.training.fitting": "dds_lightning.training.stage_cli",
     "dds_lightning.callbacks.evaluation": "dds_lightning.callbacks.rollouts",
     "dds_lightning.study.baselines": "dds_lightning.baselines.behaviour_cloning",

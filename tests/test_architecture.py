@@ -57,7 +57,7 @@ ROOMS = {
     "datamodules.sources datamodules.trajectories",
     # training
     "dds_lightning.callbacks": "agent console envs errors policy rollout skill tasks",
-    "dds_lightning.training": "callbacks configs console errors finetune module saving",
+    "dds_lightning.training": "callbacks configs console errors finetune module saving tasks",
     "dds_lightning.baselines": "errors module nn rollout tasks training",
     # what came of it
     "dds_lightning.interpret.views": "errors tasks",
@@ -144,6 +144,8 @@ ARROWS = [arrow for module in FILES for arrow in arrows_of(module)]
 
 def room_of(module: str) -> str:
     """A folder; in `interpret` and `behaviours` the folders inside; a flat file is a room of its own."""
+    if module in ROOMS:
+        return module
     parts = module.split(".")
     if len(parts) > 2 and (inner := ".".join(parts[:3])) in FILES and FILES[inner].name == "__init__.py":
         return inner

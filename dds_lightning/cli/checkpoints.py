@@ -38,14 +38,13 @@ def publish(
     from dds_lightning.sharing.verify import verify_published
     from dds_lightning.study.card import with_diagnosis
     from dds_lightning.study.contestants import agent_directory
-    from dds_lightning.tasks import get_task
+    from dds_lightning.tasks import facts_to_keep, get_task, restore_task
 
     if (run == "-") != (skill is not None):
         raise UserError(f"run is '{run}' and --skill is {skill}: give a run, or - and --skill CHECKPOINT")
     if policy is not None and skill is None:
         raise UserError(f"--policy is {policy} without --skill: give both")
-    if task is not None:
-        get_task(task)
+    chosen = None if task is None else get_task(task)
     text = None if card is None else _text(card)
     if skill is not None:
         from dds_lightning.policy import PolicyModule
@@ -53,12 +52,13 @@ def publish(
 
         chooser = None if policy is None else PolicyModule.load(policy)
         agent = DDSAgent(SkillModule.load(skill), chooser, "random" if chooser is None else "sample")
-        about, metrics = {"task": task}, None
+        about, metrics = {"task": None} if chosen is None else facts_to_keep(chosen), None
     else:
         source = agent_directory(Path(run))
         published = load_published(source)
         agent = DDSAgent.load(source)
-        about, metrics = {"task": task or published.config.get("task")}, dict(published.metrics)
+        chosen = chosen or restore_task(published.config, source)
+        about, metrics = {"task": None} if chosen is None else facts_to_keep(chosen), dict(published.metrics)
         if text is None:
             text = (source / CARD).read_text(encoding="utf-8")
             if (Path(run) / "report").is_dir():

@@ -14,7 +14,7 @@ from dds_lightning.rollout.play import rollout
 from dds_lightning.saving.published import load_published
 from dds_lightning.study.contestants import agent_directory, best_directory, way
 from dds_lightning.study.protocol import BEST, LAST, heading, paper_line, protocol
-from dds_lightning.tasks import Task, get_task
+from dds_lightning.tasks import Task, get_task, restore_task
 
 
 def evaluate(
@@ -39,10 +39,9 @@ def evaluate(
     """
     places = _places(directory, checkpoint)
     first = next(iter(places.values()))
-    name = task or load_published(first).config.get("task")
-    if name is None:
+    wanted = get_task(task) if task else restore_task(load_published(first).config, first)
+    if wanted is None:
         raise UserError(f"{first} does not say which task it is for: give --task")
-    wanted = get_task(name)
     count = wanted.evaluation_episodes if episodes is None else episodes
     if count < 1:
         raise UserError(f"--episodes is {count}, expected at least 1")
@@ -61,7 +60,7 @@ def evaluate(
     result = rollout(wanted, players, seed=seed, workers=workers)
     summary = result.summary()
     summary.insert(1, "checkpoint", summary["actor"].map(shown))
-    data: dict[str, Any] = {"agent": places.get(LAST), "best": places.get(BEST), "task": name, "seed": seed}
+    data: dict[str, Any] = {"agent": places.get(LAST), "best": places.get(BEST), "task": wanted.name, "seed": seed}
     hidden = ["checkpoint", *([] if wanted.measures_success else ["success", "length_success"])]
     differing = [f"The best checkpoint's: {heading({**other, 'checkpoint': BEST})}" for other in others if other != how]
     lines: list[Any] = [heading(how), *differing, table(summary.drop(columns=hidden))]

@@ -12,8 +12,9 @@ import pandas as pd
 from dds_lightning.errors import UserError
 from dds_lightning.rollout.result import RolloutResult
 from dds_lightning.saving.run_directory import read_marker
+from dds_lightning.study.run_task import recall_task
 from dds_lightning.study.tables import failures_table, skills_table, summary_table
-from dds_lightning.tasks import Task, get_task
+from dds_lightning.tasks import Task, known_task
 
 STAGES = ("data", "skill", "relabel", "policy", "clone", "evaluate")
 
@@ -56,9 +57,10 @@ class Findings:
                 f"{root} holds no evaluation (evaluate/episodes.parquet): expected a directory that `dds run` "
                 "has brought at least as far as its stage 'evaluate'"
             )
+        recall_task(root)
         result = RolloutResult.load(root / "evaluate")
         episodes = result.episodes
-        task = get_task(result.task)
+        task = known_task(result.task)
         main = str(episodes["actor"].iloc[0])
         parts = episodes.groupby("actor", sort=False)["label"].nunique()
         singles = next((str(name) for name in parts.index[parts > 1]), None)

@@ -22,7 +22,7 @@ from dds_lightning.study.diagnosis import diagnose
 from dds_lightning.study.findings import Findings
 from dds_lightning.study.protocol import heading, paper_line
 from dds_lightning.study.tables import ends, readable
-from dds_lightning.tasks import get_task
+from dds_lightning.tasks import known_task
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -100,7 +100,7 @@ def told(facts: Mapping[str, Any]) -> list[RenderableType]:
     """Format the facts of `write_report` for a terminal: the table, and where the main contestant's failures ended."""
     from dds_lightning.console.reports import table
 
-    task, protocol = get_task(facts["task"]), facts.get("protocol")
+    task, protocol = known_task(facts["task"]), facts.get("protocol")
     summary = readable(pd.DataFrame(facts["table"]), task)
     text: list[RenderableType] = [heading(protocol) if protocol else facts["task"], table(summary)]
     if line := paper_line(task):

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from dds_lightning.interpret.measure.replay import junctions as junctions
-from dds_lightning.interpret.measure.replay import replay_codes, rest_states
+from dds_lightning.interpret.measure.replay import replay_codes
+from dds_lightning.interpret.measure.states import junctions as junctions
+from dds_lightning.interpret.measure.states import rest_states
 from dds_lightning.saving.files import written_whole
 from dds_lightning.tasks import Task
 

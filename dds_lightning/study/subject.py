@@ -20,7 +20,8 @@ from dds_lightning.saving.run_directory import read_marker
 from dds_lightning.skill import SkillModule
 from dds_lightning.study.contestants import agent_directory, way
 from dds_lightning.study.findings import Findings
-from dds_lightning.tasks import Task, get_task
+from dds_lightning.study.run_task import recall_task
+from dds_lightning.tasks import Task, get_task, known_task, restore_task
 
 SINGLE = "single skill"
 
@@ -56,6 +57,7 @@ def find_subject(place: Path, seed: int = 0) -> Subject:
     """
     if place.is_file() or place.suffix == ".ckpt":
         return Subject(_skills_alone(place, seed), None, None, None, f"skill checkpoint {place}")
+    recall_task(place)
     data, task = _data_of(place)
     if not (place / "model.safetensors").is_file() and not (place / "agent" / "model.safetensors").is_file():
         checkpoint = place / "skill" / "last.ckpt"
@@ -68,7 +70,8 @@ def find_subject(place: Path, seed: int = 0) -> Subject:
     directory = agent_directory(place)
     from dds_lightning.saving.published import load_published
 
-    task = load_published(directory).config.get("task") or task
+    kept = restore_task(load_published(directory).config, directory)
+    task = kept.name if kept else task
     found = Findings.read(place) if (place / "evaluate" / "episodes.parquet").is_file() else None
     return Subject(DDSAgent.load(directory, seed=seed), task, data, found, f"published agent {directory}")
 
@@ -114,7 +117,7 @@ def atlas(
         raise UserError(f"{place} does not know its data: give --data, for example local:DIR, minari:ID or d4rl:FILE")
     if name is None:
         raise UserError(f"{place} does not say which task it is for: give --task; `dds tasks` lists them")
-    wanted = resolve_task(spec, get_task(name))
+    wanted = resolve_task(spec, get_task(task) if task else known_task(name))
     models = [SkillModule.load(path) for path in against]
     tell("reading the data")
     trajectories = load_trajectories(spec, wanted)

@@ -17,6 +17,7 @@ from dds_lightning.interpret.atlas.pictures import Picture
 from dds_lightning.interpret.draw.palette import ink, skill_colour
 from dds_lightning.interpret.draw.png import small_png
 from dds_lightning.interpret.measure.recovery import RoundTrip
+from dds_lightning.interpret.views import view_of
 from dds_lightning.saving.files import written_whole
 from dds_lightning.tasks import Task
 
@@ -45,25 +46,23 @@ class Measure(NamedTuple):
 
 def measures(task: Task) -> list[Measure]:
     """The columns of the table, with units as they are for a task; in the page's order."""
-    runner, arm = task.family == "locomotion", task.family == "kitchen"
-    far, fast = ("rad", "rad/s") if arm else ("m", "m/s")
-    where = "its arm's joints" if arm else "the body"
+    view = view_of(task)
+    far, fast = view.units
     goal = task.measures_success and not task.subtasks
-    turn = "its pitch changes" if runner else "it turns from the first half's way to the second's, left is positive"
     return [
         Measure("share", "share of the data", "%", ".1f", 100, "Segments of the data to which the encoder gives it."),
         Measure("chosen", "chosen", "%", ".1f", 100, "How likely the policy chooses it, over the states of the data."),
         Measure("again", "found again", "%", ".0f", 100, "Its replays, where the data use it, that are it again."),
         Measure("recovered", "recovered", "%", ".0f", 100, "Its replays, from any state, that are it again.", False),
         Measure("alone", "alone", "%" if goal else "points", ".0f", 1, _alone_words(goal)),
-        Measure("distance", "displacement", far, ".2f", 1, f"How far a segment moves {where}, on average."),
+        Measure("distance", "displacement", far, ".2f", 1, f"How far a segment moves {view.mover}, on average."),
         Measure("dx", "along x", "m", "+.2f", 1, "Mean displacement along x."),
         Measure("dy", "along y", "m", "+.2f", 1, "Mean displacement along y."),
         Measure("dz", "along z", "m", "+.2f", 1, "Mean displacement along z."),
         Measure("ahead", "ahead", "m", "+.2f", 1, "Mean displacement along the way it faces when a segment begins."),
         Measure("left", "to its left", "m", "+.2f", 1, "Mean displacement across that way."),
         Measure("speed", "speed", fast, ".2f", 1, "Mean speed along the way."),
-        Measure("turn", "pitch change" if runner else "turn", "°", "+.1f", 1, f"How far {turn}, on average."),
+        Measure("turn", view.turn, "°", "+.1f", 1, f"How far {view.turns}, on average."),
         Measure("turning", "turning", "°", ".1f", 1, "The size of it, left or right.", False),
         Measure("reward", "reward", "", ".3g", 1, "Of a segment, not discounted, in the task's own unit."),
         Measure("value", "value", "", ".3g", 1, "The critic's V where segments with this code begin."),

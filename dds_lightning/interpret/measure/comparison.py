@@ -19,7 +19,8 @@ from datamodules.relabel import check_widths
 from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError
 from dds_lightning.interpret.measure.recovery import code_recovery, round_trip
-from dds_lightning.interpret.measure.replay import draw_states, simulator
+from dds_lightning.interpret.measure.replay import simulator
+from dds_lightning.interpret.measure.states import draw_states
 from dds_lightning.tasks import Task
 
 if TYPE_CHECKING:

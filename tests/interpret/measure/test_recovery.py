@@ -9,7 +9,8 @@ from dds_lightning.interpret.draw.charts import plot_comparison, plot_effects, p
 from dds_lightning.interpret.measure.comparison import cluster_skills, compare_recovery, decoding_error
 from dds_lightning.interpret.measure.information import mutual_information
 from dds_lightning.interpret.measure.recovery import code_recovery, displacements, encode_replays, round_trip
-from dds_lightning.interpret.measure.replay import Replays, rest_states, simulator
+from dds_lightning.interpret.measure.replay import Replays, simulator
+from dds_lightning.interpret.measure.states import rest_states
 from dds_lightning.tasks import get_task
 from tests.interpret.tiny import Compass, Deaf, recorded, tiny_skill
 
