@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 
 from datamodules.behaviours import AntController, load_ladder
-from datamodules.behaviours.publish import MAZES, NOISES, publish_mazes
 from datamodules.behaviours.shipped import SHIPPED
+from datamodules.behaviours.training.publish import MAZES, NOISES, publish_mazes
 from dds_lightning.envs.antmaze import D4RLAntMazeEnv
 from dds_lightning.errors import UserError
 
