@@ -126,7 +126,7 @@ class MLPPolicy:
             )
         except KeyError as error:
             raise DataError(
-                f"behaviour policy {path}: {error} is missing, expected a file that MLPPolicy.save wrote; train it again"
+                f"behaviour policy {path}: has no {error}, expected a file that MLPPolicy.save wrote; train it again"
             ) from error
         policy._check(header.get("format"), path)
         return policy
