@@ -1,7 +1,7 @@
 """Downloads one file: with progress, resumed where it was cut off, and complete or not at all.
 
-None of the project's dependencies resumes a download from any server: urllib and torch.hub start from nothing again, and
-a data set of D4RL has hundreds of megabytes.
+None of the project's dependencies resumes a download from any server: urllib and torch.hub start from nothing again,
+and a data set of D4RL has hundreds of megabytes.
 """
 
 from __future__ import annotations
