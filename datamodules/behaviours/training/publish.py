@@ -15,16 +15,11 @@ import numpy as np
 import pandas as pd
 
 from datamodules.behaviours.policy import MLPPolicy
-from datamodules.behaviours.training.evaluation import (
-    RunnerScore,
-    WalkScore,
-    score_navigator,
-    score_runner,
-    score_walker,
-)
+from datamodules.behaviours.training.evaluation import RunnerScore, score_navigator, score_runner, score_walker
 from datamodules.behaviours.training.recipes import RECIPES, Recipe, get_recipe
 from dds_lightning.errors import UserError
 from dds_lightning.saving.files import sha256, written_whole
+from dds_lightning.saving.templates import render
 from dds_lightning.tasks import get_task
 
 NOISES = (0.0, 0.1, 0.2)
@@ -157,66 +152,11 @@ def draw_curve(curve: pd.DataFrame, column: str, label: str, path: Path) -> None
         figure.savefig(part, dpi=90, format="png")
 
 
-def _walk_row(score: WalkScore) -> str:
-    return (
-        f"| {score.action_noise:g} | {score.speed:.2f} | {score.upright_speed:.2f} | {score.falls_per_1000:.3f} | "
-        f"{100 * score.on_its_back:.1f} % |"
-    )
-
-
 def ant_card(folder: Path) -> str:
-    """The card of the Ant's controllers, from the metadata in their files."""
-    text = """# Ant controllers: they walk where they are told
-
-```python
-from datamodules.behaviours import AntController
-
-controller = AntController("d4rl")  # dds/AntMazeD4RL_*; "robotics" for AntMaze_*-v4, where it is shipped
-actions = controller.act(observations, headings)  # (B, 29), (B,) radians in the world frame -> (B, 8)
-```
-
-Each file is one policy in NumPy (128 x 128 tanh) with its observation statistics; its header says what it was trained
-on and how it scored. Scores: 64 Ants, one episode of 1,000 steps each on an endless floor, without resets; the heading
-is drawn anew, anywhere, every 10 to 80 steps (d4rl; 20 to 160 in robotics' half as long steps). A fall is a tilt of
-more than 90 degrees.
-"""
-    for path in sorted(folder.glob("*.safetensors")):
-        facts = MLPPolicy.load(path).metadata
-        rows = "\n".join(_walk_row(WalkScore(**score)) for score in facts["scores"])
-        text += f"""
-## {path.stem}
-
-| action noise | speed along the heading, m/s | before the first fall | falls per 1,000 steps | on its back at the end |
-| --: | --: | --: | --: | --: |
-{rows}
-
-{facts["algorithm"]}, {facts["steps"]:,} environment steps, {facts["hours"]:.2f} hours of one core:
-`python -m datamodules.behaviours.train {facts["behaviour"]}`, then
-`python -m datamodules.behaviours.publish {facts["behaviour"]}`.{" " + facts["note"] if facts["note"] else ""}
-
-![training curve](curve-{path.stem}.png)
-"""
-    mazes = folder / MAZES
-    return text + (maze_table(pd.read_csv(mazes)) if mazes.is_file() else "")
-
-
-def maze_table(walks: pd.DataFrame) -> str:
-    """The card's section on mazes, from the rows of `score_navigator`."""
-    rows = "\n".join(
-        f"| {row.maze} | {row.action_noise:g} | {100 * row.reached / row.episodes:.0f} % | {row.median_steps:.0f} | "
-        f"{row.cap} |"
-        for row in walks.itertuples(index=False)
-    )
-    return f"""
-## From the start to the goal of D4RL's mazes
-
-A planner over cells tells it where to walk (`AntNavigator`); {walks["episodes"].min()} episodes each, steps of those
-that reach the goal: `python -m datamodules.behaviours.publish ant --mazes {walks["episodes"].min()}`.
-
-| maze | action noise | reached | median steps | time-out |
-| --- | --: | --: | --: | --: |
-{rows}
-"""
+    """The card of the Ant's controllers, from the metadata in their files and the table of mazes, if there is one."""
+    policies = {path.stem: MLPPolicy.load(path).metadata for path in sorted(folder.glob("*.safetensors"))}
+    walks = pd.read_csv(folder / MAZES) if (folder / MAZES).is_file() else None
+    return render("datamodules.behaviours.training", "ant_card.md.jinja", {"policies": policies, "walks": walks})
 
 
 def publish_mazes(episodes: int, out: Path) -> Path:
@@ -241,39 +181,10 @@ def publish_mazes(episodes: int, out: Path) -> Path:
     return write_card(folder, ant_card(folder))
 
 
-def runner_card(recipe: Recipe, built: list[Rung], note: str) -> str:
+def runner_card(recipe: Recipe, rungs: list[Rung], note: str) -> str:
     """The card of a runner's ladder."""
-    task = get_task(f"{recipe.name}-medium")
-    rows = "\n".join(
-        f"| {rung.name} | {rung.policy.metadata['steps']:,} | {rung.score.score:.1f} | "
-        f"{rung.score.mean_return:.0f} ± {rung.score.std_return:.0f} | {rung.score.mean_steps:.0f} | "
-        f"{rung.sampled.score:.1f} |"
-        for rung in built
-    )
-    last = built[-1].policy.metadata
-    return f"""# {recipe.name}: a ladder of behaviour policies, random to expert
-
-```python
-from datamodules.behaviours import load_ladder
-
-policies = load_ladder("{recipe.name}")  # name -> policy, rising scores, the last one is "expert"
-actions = policies["expert"].act(observations)  # (B, {task.observation_dim}) -> (B, {task.action_dim})
-```
-
-Scores in {task.env_id}, {built[0].score.episodes} episodes each, normalised as D4RL does ({task.score_min:.0f} is 0,
-{task.score_max:.0f} is 100). "Sampled" draws actions with the noise that the policy had in training
-(`act(observations, rng)`); the other columns take its means.
-
-| file | training steps | score | return | episode length | score, sampled |
-| --- | --: | --: | --: | --: | --: |
-{rows}
-
-PPO, {last["steps"]:,} environment steps up to the expert, {last["hours"]:.2f} hours of one core:
-`python -m datamodules.behaviours.train {recipe.name}`, then `python -m datamodules.behaviours.publish {recipe.name}`.
-`sha256sum -c SHA256SUMS` checks the files.{" " + note if note else ""}
-
-![training curve](curve.png)
-"""
+    values = {"name": recipe.name, "task": get_task(f"{recipe.name}-medium"), "rungs": rungs, "note": note}
+    return render("datamodules.behaviours.training", "runner_card.md.jinja", values)
 
 
 def main() -> None:

@@ -6,18 +6,18 @@ The page itself is the template `page.html.jinja`; here are its tables of column
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
-from jinja2 import Environment, StrictUndefined
 
 from dds_lightning.interpret.atlas.build import Atlas
 from dds_lightning.interpret.draw.palette import ink, skill_colour
 from dds_lightning.interpret.draw.png import small_png
 from dds_lightning.saving.files import written_whole
+from dds_lightning.saving.templates import render
 from dds_lightning.tasks import Task
 
 
@@ -114,31 +114,28 @@ def page(atlas: Atlas, about: Sequence[tuple[str, str]] = (), command: str = "")
         about: Facts for its head, as (name, text).
         command: The command that makes the page again.
     """
-    environment = Environment(
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
-    )
-    environment.filters |= {
+    table = atlas.table.astype({"code": int, "nearest": int})
+    ranked = table.sort_values("share", ascending=False, kind="stable").to_dict(orient="records")
+    values = {
+        "atlas": atlas,
+        "about": about,
+        "command": command,
+        "style": files("dds_lightning.interpret").joinpath("atlas.css").read_text(encoding="utf-8"),
+        "sections": [one for one in SECTIONS if not one.pictures or not atlas.pictures.keys().isdisjoint(one.pictures)],
+        "shown": [measure for measure in measures(atlas.task) if measure.name in table],
+        "rows": table.to_dict(orient="records"),
+        "ranked": ranked,
+        "unused": sorted(row["code"] for row in ranked if row["code"] not in atlas.clips),
+    }
+    filters: dict[str, Callable[..., Any]] = {
         "base64": lambda data: base64.b64encode(data).decode("ascii"),
         "ink": ink,
         "number": _number,
         "percent": lambda share, digits=1: f"{100 * share:.{digits}f}",
         "skill_colour": skill_colour,
     }
-    environment.tests["known"] = lambda value: not _missing(value)
-    table = atlas.table.astype({"code": int, "nearest": int})
-    ranked = table.sort_values("share", ascending=False, kind="stable").to_dict(orient="records")
-    template = files("dds_lightning.interpret.atlas").joinpath("page.html.jinja").read_text(encoding="utf-8")
-    text = environment.from_string(template).render(
-        atlas=atlas,
-        about=about,
-        command=command,
-        style=files("dds_lightning.interpret").joinpath("atlas.css").read_text(encoding="utf-8"),
-        sections=[one for one in SECTIONS if not one.pictures or not atlas.pictures.keys().isdisjoint(one.pictures)],
-        shown=[measure for measure in measures(atlas.task) if measure.name in table],
-        rows=table.to_dict(orient="records"),
-        ranked=ranked,
-        unused=sorted(row["code"] for row in ranked if row["code"] not in atlas.clips),
-    )
+    tests = {"known": lambda value: not _missing(value)}
+    text = render("dds_lightning.interpret.atlas", "page.html.jinja", values, filters=filters, tests=tests)
     return text.lstrip()  # the macros leave empty lines
 
 
