@@ -59,10 +59,8 @@ def test_the_cards_are_what_publishing_writes():
         Rung(name, policy, *(RunnerScore(**policy.metadata[key]) for key in ("score", "score_sampled")))
         for name, policy in load_ladder("hopper").items()
     ]
-    lines = runner_card(get_recipe("hopper"), rungs, "").splitlines()
-    shipped = (SHIPPED / "hopper" / "README.md").read_text(encoding="utf-8").splitlines()
-    assert len(lines) == len(shipped)  # the numbers were rounded once more on their way into the metadata
-    assert [a for a, b in zip(lines, shipped, strict=True) if a != b and not a.startswith("|")] == []
+    note = "Training was stopped after 778,272 of the recipe's 1,200,000 steps."
+    assert runner_card(get_recipe("hopper"), rungs, note) == (SHIPPED / "hopper" / "README.md").read_text("utf-8")
 
 
 def test_paths_are_the_repositorys():
