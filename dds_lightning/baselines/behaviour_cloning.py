@@ -7,8 +7,7 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -183,6 +182,7 @@ def fit_clone(
     from datamodules.segments import SegmentDataModule
     from dds_lightning.callbacks.rolling import RollingCheckpoint
     from dds_lightning.console import interrupts
+    from dds_lightning.rollout.play import torch_threads
     from dds_lightning.training.stage_cli import quieten
     from dds_lightning.training.trainer import trainer_settings
 
@@ -210,18 +210,7 @@ def fit_clone(
     saving = RollingCheckpoint(str(directory))
     trainer = pl.Trainer(**trainer_settings(settings, [saving]))
     last = directory / "last.ckpt"
-    with interrupts.deferred(), _one_thread():
+    with interrupts.deferred(), torch_threads(1):
         trainer.fit(clone, module, ckpt_path=last if last.is_file() else None, weights_only=True)
     assert saving.path is not None
     return saving.path
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """One thread for a network so small: more gain little on an idle machine and cost much on a busy one."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

@@ -237,13 +237,10 @@ class AntWorld(VecEnv):
         """The attribute of this object, which all Ants share, once per Ant."""
         return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Not supported."""
-        raise NotImplementedError
+    def _unsupported(self, *args: Any, **kwargs: Any) -> Any:
+        raise NotImplementedError("the Ants of an AntWorld have no attributes or methods of their own")
 
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        """Not supported."""
-        raise NotImplementedError
+    set_attr = env_method = _unsupported
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         """False: no Ant has a wrapper of its own."""
