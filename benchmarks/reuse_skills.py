@@ -186,10 +186,10 @@ def plot(table: pd.DataFrame) -> Figure:
     figure = Figure(figsize=(9.5, 3.6), layout="constrained")
     panels = figure.subplots(1, 3)
     for way in WAYS:
-        own = table[table["way"] == way.name]
-        _band(panels[0], own[own["stage"] == "policy"], "step", "success", way)
-        _band(panels[1], own[own["stage"] == "policy"], "seconds", "success", way)
-        _band(panels[2], own[own["stage"] == "skill"], "step", "rmse", way)
+        part = table[table["way"] == way.name]
+        _band(panels[0], part[part["stage"] == "policy"], "step", "success", way)
+        _band(panels[1], part[part["stage"] == "policy"], "seconds", "success", way)
+        _band(panels[2], part[part["stage"] == "skill"], "step", "rmse", way)
     panels[0].set(xlabel="steps in Large, skills and policy", ylabel="success in Large, %")
     panels[1].set(xlabel="seconds of one core in Large")
     panels[2].set(xlabel="steps of skill training in Large", ylabel="error of decoded actions (RMSE)")
@@ -213,9 +213,9 @@ def summary(table: pd.DataFrame) -> pd.DataFrame:
     """One row per way: mean and standard deviation over seeds at the end, and when three quarters succeed."""
     rows = []
     for way in WAYS:
-        own = table[(table["way"] == way.name) & (table["stage"] == "policy")]
-        last = own.groupby("seed").last()
-        arrived = own[own["success"] >= 75].groupby("seed").first().reindex(last.index)
+        part = table[(table["way"] == way.name) & (table["stage"] == "policy")]
+        last = part.groupby("seed").last()
+        arrived = part[part["success"] >= 75].groupby("seed").first().reindex(last.index)
         rows.append(
             {
                 "skills in Large": way.name,

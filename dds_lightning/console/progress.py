@@ -69,9 +69,12 @@ def progress_bar(
     Yields:
         A function that takes `advance`, `completed`, `total`, `description` and fields; see rich's `Progress.update`.
     """
+    if not shown:  # not rich's `disable`: in rich 13.7 that writes an empty line
+        yield lambda **changes: None
+        return
     columns = [COLUMNS[name]() if name in COLUMNS else TextColumn(name) for name in layout]
     console = console or Console(stderr=True)
-    with Progress(*columns, console=console, transient=transient, disable=not shown) as progress:
+    with Progress(*columns, console=console, transient=transient) as progress:
         yield partial(progress.update, progress.add_task(description, total=total, **fields))
 
 
