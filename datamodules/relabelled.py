@@ -45,7 +45,7 @@ class RelabeledDataModule(pl.LightningDataModule):
         reward_shift: overrides the task's shift of the learning reward.
         batch_size: transitions a batch.
         validation_fraction: share of the episodes held out.
-        seed: of the split and of the order.
+        seed: of the split and of the order. On the command line it follows ``--seed_everything``; null means 0.
         device_resident: keep the transitions on the accelerator.
     """
 
@@ -65,10 +65,11 @@ class RelabeledDataModule(pl.LightningDataModule):
         reward_shift: float | None = None,
         batch_size: int = 256,
         validation_fraction: float = 0.05,
-        seed: int = 0,
+        seed: int | None = None,
         device_resident: bool = False,
     ) -> None:
         super().__init__()
+        seed = seed or 0
         self.save_hyperparameters()
         self.task: Task | None = get_task(task) if task else None
         if skill is None:
@@ -101,6 +102,16 @@ class RelabeledDataModule(pl.LightningDataModule):
         if self.task is not None:
             self.task = resolve_task(self.hparams.data, self.task)
         return load_trajectories(self.hparams.data, self.task)
+
+    @property
+    def batch_size(self) -> int:
+        """B."""
+        return int(self.hparams.batch_size)
+
+    @property
+    def horizon(self) -> int:
+        """H, of the skills."""
+        return self.skill.horizon
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -50,7 +50,7 @@ class SegmentDataModule(pl.LightningDataModule):
         stride: int = 1,
         batch_size: int = 128,
         validation_fraction: float = 0.05,
-        seed: int = 0,
+        seed: int | None = None,
         device_resident: bool = False,
         max_validation_segments: int = 4096,
     ) -> None:
@@ -63,7 +63,8 @@ class SegmentDataModule(pl.LightningDataModule):
             stride: Steps between segments: 1 takes every window, H divides episodes into separate segments.
             batch_size: B.
             validation_fraction: Share of the steps, in whole episodes, that is kept for validation.
-            seed: Of the split and of the order of batches.
+            seed: Of the split and of the order of batches. On the command line it follows `--seed_everything`;
+                None means 0.
             device_resident: Keep the data on the training device; batches are then made there.
             max_validation_segments: At most this many segments, evenly spread, are validated.
         """
@@ -77,7 +78,7 @@ class SegmentDataModule(pl.LightningDataModule):
             raise UserError(f"validation_fraction: found {validation_fraction}, expected 0 to less than 1")
         self.task = get_task(task) if task is not None else None
         self.data, self.horizon, self.stride, self.batch_size = data, horizon, stride, batch_size
-        self.validation_fraction, self.seed = validation_fraction, seed
+        self.validation_fraction, self.seed = validation_fraction, seed or 0
         self.device_resident, self.max_validation_segments = device_resident, max_validation_segments
         self._windows: Windows | None = None
         self._on_device: dict[torch.device, tuple[Tensor, Tensor]] = {}

@@ -69,12 +69,12 @@ def start_from(module: StageModule, path: str) -> None:
         theirs["bottleneck.ema_count"] = torch.ones_like(own["bottleneck.ema_count"])
     misfits = [name for name, value in own.items() if name not in theirs or theirs[name].shape != value.shape]
     left = {name for name in own if name in module.OF_DATA}
-    if module.hparams.refit_normaliser or any(name.startswith(STATISTICS) for name in misfits):
+    if module.hparams.get("refit_normaliser") or any(name.startswith(STATISTICS) for name in misfits):
         left |= {name for name in own if name.startswith(STATISTICS)}
     frozen = tuple(f"{name}." for name in module.frozen_modules)
     _refuse_random(module, [name for name in misfits if name.startswith(frozen)], path)
     used = [name for name in module.frozen_modules if name != "bottleneck"]  # codes are no observations
-    if used and module.hparams.refit_normaliser:
+    if used and module.hparams.get("refit_normaliser"):
         raise UserError(
             f"model.refit_normaliser is True, but what is frozen ({', '.join(used)}) expects the statistics it was "
             "trained with: leave it false, or train all of it"

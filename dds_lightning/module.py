@@ -14,24 +14,28 @@ from torch import nn
 from dds_lightning.errors import UserError
 from dds_lightning.finetune import read, start_from
 from dds_lightning.nn.normaliser import Normaliser
-from dds_lightning.saving.checkpoint import load_module
+from dds_lightning.saving.checkpoint import STAGE_KEY, load_module
 
 Schedule = Literal["constant", "cosine"]
 
 
 class StageModule(pl.LightningModule):
-    """What the skill model and the policy share: checked settings, a start from weights, Adam by part.
+    """A training stage's module: checked settings, a start from weights, Adam by part.
 
-    A subclass calls `save_hyperparameters(ignore=["init_from"])`, builds itself, then calls `_begin`.
+    A subclass calls `save_hyperparameters(ignore=["init_from"])`, builds itself (its observations go through
+    `normaliser`), then calls `_begin`. Its settings `lr` and `lr_schedule` are needed; `warmup_steps`, `init_from`,
+    `trainable`, `lr_scale` and `refit_normaliser` are understood where it has them.
     """
 
     hparams: Any  # Lightning gives its settings as attributes, but types them as a mapping
     STAGE: ClassVar[str]
-    """Name of the module in a published directory."""
-    PARTS: ClassVar[Mapping[str, tuple[str, ...]]]
+    """Name of its training stage, in every checkpoint, and of the module in a published directory."""
+    PARTS: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     """What can be frozen or slowed down, and the submodules that belong to it."""
-    SHAPE: ClassVar[tuple[str, ...]]
+    SHAPE: ClassVar[tuple[str, ...]] = ()
     """Settings in which a checkpoint to start from must agree."""
+    PREDICTION: ClassVar[str] = "code"
+    """What `predict_step` returns one of for each row."""
     OF_DATA: ClassVar[tuple[str, ...]] = ()
     """Buffers that always come from the data."""
 
@@ -42,9 +46,9 @@ class StageModule(pl.LightningModule):
         """Refuse settings: (name, whether it is fine, what is expected)."""
         h = self.hparams
         allowed = ", ".join(self.PARTS)
-        named = [h.trainable] if isinstance(h.trainable, str) else list(h.trainable)
+        named = self._named_parts
         parts = bool(named) and (named == ["all"] or set(named) <= set(self.PARTS))
-        scales = h.lr_scale or {}
+        scales = h.get("lr_scale") or {}
         common = [
             ("trainable", parts, f"all or some of {allowed}"),
             ("lr_scale", set(scales) <= set(self.PARTS), f"factors for some of {allowed}"),
@@ -60,9 +64,13 @@ class StageModule(pl.LightningModule):
     @property
     def trained_parts(self) -> tuple[str, ...]:
         """Names of the parts that learn."""
-        trainable = self.hparams.trainable
-        named = [trainable] if isinstance(trainable, str) else trainable
+        named = self._named_parts
         return tuple(part for part in self.PARTS if named == ["all"] or part in named)
+
+    @property
+    def _named_parts(self) -> list[str]:
+        trainable = self.hparams.get("trainable", "all")
+        return [trainable] if isinstance(trainable, str) else list(trainable)
 
     @property
     def frozen_modules(self) -> tuple[str, ...]:
@@ -98,6 +106,10 @@ class StageModule(pl.LightningModule):
     def after_step(self, step: int) -> None:
         """Follow up on optimiser step `step`, counted from 1."""
 
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Say whose checkpoint it is."""
+        checkpoint[STAGE_KEY] = self.STAGE
+
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """A training that goes on does not start from anything."""
         self.init_from = None
@@ -114,13 +126,13 @@ class StageModule(pl.LightningModule):
         """Adam over everything that learns together, with a learning rate for each part where `lr_scale` says so."""
         h = self.hparams
         parameters: Any = self.parameters()
-        if h.lr_scale:
+        if h.get("lr_scale"):
             parameters = [
                 {"params": own, "lr": h.lr * h.lr_scale.get(part, 1.0), "name": part}
                 for part in self.trained_parts
                 if (own := [p for n in self.PARTS[part] for p in getattr(self, n).parameters() if p.requires_grad])
             ]
-        return adam(parameters, h.lr, h.lr_schedule, h.warmup_steps, self)
+        return adam(parameters, h.lr, h.lr_schedule, h.get("warmup_steps", 0), self)
 
     def fingerprint(self) -> str:
         """SHA-256 of all weights and buffers with their names: the same for the same model, wherever it lies."""

@@ -9,7 +9,6 @@ from dds_lightning.configs import (
     ROOT,
     RUN_DEFAULTS,
     find,
-    find_preset,
     packaged,
     resolve_configs,
     run_defaults,
@@ -18,6 +17,7 @@ from dds_lightning.errors import UserError
 from dds_lightning.pipeline.settings import RunSettings
 from dds_lightning.tasks import get_task, task_names
 from dds_lightning.training.stage_cli import settings_of
+from dds_lightning.training.stages import preset_configs
 
 
 def _flat(value, prefix=""):
@@ -38,7 +38,11 @@ def test_every_packaged_configuration_parses_and_nothing_in_it_is_lost(name):
 
 def test_every_family_of_tasks_has_a_preset_and_so_has_the_paper():
     for family in {get_task(name).family for name in task_names()} | {"paper"}:
-        assert {path.name for path in find_preset(family).values()} == {"skill.yaml", "policy.yaml"}
+        assert {path.name for path in preset_configs(family).values()} == {
+            "skill.yaml",
+            "policy.yaml",
+            "clone.yaml",
+        }
 
 
 def test_the_papers_skill_settings_are_tables_4_to_6():
@@ -64,6 +68,13 @@ def test_the_papers_policy_settings_are_table_7():
     assert settings["trainer"]["max_steps"] - model["critic_steps"] == 500_000
 
 
+@pytest.mark.parametrize("stage", ["skill", "clone"])
+def test_the_split_and_the_order_of_data_follow_the_seed_unless_they_have_their_own(stage):
+    assert settings_of(stage, ["fit"])["data"]["seed"] == 0
+    assert settings_of(stage, ["fit", "--seed_everything=5"])["data"]["seed"] == 5
+    assert settings_of(stage, ["fit", "--seed_everything=5", "--data.seed=2"])["data"]["seed"] == 2
+
+
 def test_a_packaged_name_is_found_with_and_without_its_ending():
     assert find("pointmaze/skill") == find("pointmaze/skill.yaml") == ROOT / "pointmaze" / "skill.yaml"
 
@@ -86,13 +97,13 @@ def test_an_unknown_configuration_or_preset_lists_the_packaged_ones(tmp_path):
     with pytest.raises(UserError, match=r"no file nope.yaml.*paper/skill.yaml"):
         find("nope.yaml")
     with pytest.raises(UserError, match=r"no folder nope.*paper, pointmaze"):
-        find_preset("nope")
+        preset_configs("nope")
     with pytest.raises(UserError, match=r"has no skill.yaml"):
-        find_preset(str(tmp_path))
+        preset_configs(str(tmp_path))
 
 
 def test_a_presets_run_fills_in_what_was_not_asked_for(tmp_path):
-    for stage, path in find_preset("pointmaze").items():
+    for stage, path in preset_configs("pointmaze").items():
         (tmp_path / f"{stage}.yaml").write_text(path.read_text())
     assert run_defaults(str(tmp_path)) == RUN_DEFAULTS
     (tmp_path / "run.yaml").write_text("data_steps: 1000\ntemperature: 1\nselection: greedy\n")
@@ -107,11 +118,11 @@ def test_a_presets_run_fills_in_what_was_not_asked_for(tmp_path):
     [
         ("steps: 3", "run.yaml sets steps, expected only data_steps, clone_steps, selection, temperature"),
         ("data_steps: many", "run.yaml sets data_steps to 'many', expected a value like 200000"),
-        ("- 3", "run.yaml holds no settings"),
-        ("selection: [greedy", "run.yaml is no YAML: while parsing a flow sequence"),
+        ("- 3", "run.yaml is not a mapping"),
+        ("selection: [greedy", "run.yaml is not valid YAML: while parsing a flow sequence"),
     ],
 )
-def test_a_presets_run_that_is_none_is_refused(tmp_path, text, message):
+def test_a_presets_run_file_that_is_malformed_is_refused(tmp_path, text, message):
     (tmp_path / "run.yaml").write_text(text)
     with pytest.raises(UserError, match=message):
         run_defaults(str(tmp_path))
@@ -121,7 +132,12 @@ def test_a_run_tells_the_command_that_makes_it_again():
     plain = RunSettings.with_preset("hopper-medium", Path("out"))
     assert plain.command() == "dds run hopper-medium --seed=0"
     asked = RunSettings.with_preset(
-        "hopper-medium", Path("out"), seed=3, data_steps=5000, noise_scale=0.25, policy=("--model.alpha=10",)
+        "hopper-medium",
+        Path("out"),
+        seed=3,
+        data_steps=5000,
+        noise_scale=0.25,
+        stages={"policy": ("--model.alpha=10",)},
     )
     assert asked.command() == (
         "dds run hopper-medium --seed=3 --data_steps=5000 --noise_scale=0.25 --policy.model.alpha=10"

@@ -16,7 +16,7 @@ from dds_lightning.callbacks.resume import rng_state, set_rng_state
 from dds_lightning.errors import UserError
 from dds_lightning.policy import PolicyModule
 from dds_lightning.saving.checkpoint import FORMAT_KEY, AtomicCheckpointIO, load_ckpt
-from dds_lightning.saving.run_directory import Stages
+from dds_lightning.saving.run_directory import RunDirectory
 from dds_lightning.study.findings import read_marker
 
 NEWER = rf"has format 2, but this version of dds-lightning \({__version__}\) reads up to 1: install a newer one"
@@ -113,12 +113,12 @@ def test_a_run_of_a_newer_format_is_refused_and_nothing_in_it_is_touched(tmp_pat
         (folder / "out.txt").write_text("made")
         return {"file": folder / "out.txt"}
 
-    Stages(tmp_path, Console(quiet=True)).do("first", "first", {}, [], work)
+    RunDirectory(tmp_path, Console(quiet=True)).do("first", "first", {}, [], work)
     marker = tmp_path / "first" / "stage.json"
     marker.write_text(json.dumps({**json.loads(marker.read_text()), "format": 2}))
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     with pytest.raises(UserError, match=rf"stage\.json {NEWER}"):
-        Stages(tmp_path, Console(quiet=True)).do("first", "first", {}, [], work)
+        RunDirectory(tmp_path, Console(quiet=True)).do("first", "first", {}, [], work)
     with pytest.raises(UserError, match=rf"stage\.json {NEWER}"):
         read_marker(tmp_path / "first")
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before

@@ -9,40 +9,44 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
-import lightning.pytorch as pl
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from dds_lightning.errors import UserError
-from dds_lightning.module import adam
+from dds_lightning.finetune import refuse_other_box
+from dds_lightning.module import StageModule, is_log_step
 from dds_lightning.nn.mlp import MLP
 from dds_lightning.nn.normaliser import ActionBox, Normaliser
 from dds_lightning.tasks import Task
 
-LOG_EVERY = 50
-"""Optimiser steps between two logged losses."""
 
-
-class BehaviourCloning(pl.LightningModule):
+class BehaviourCloning(StageModule):
     """Regress the data's actions on its observations.
 
     A training batch is ``{"observations": (B, H, O), "actions": (B, H, A)}`` in the environment's own units;
     each of the B x H steps is one sample.
 
     Args:
-        observation_dim: O.
-        action_dim: A.
-        hidden_dims: widths of the hidden layers.
-        lr: learning rate of Adam.
-        lr_schedule: ``constant`` or ``cosine`` decay to zero at ``max_steps``.
+        observation_dim: O, linked from the data on the command line.
+        action_dim: A, linked from the data.
+        hidden_dims: Widths of the hidden layers.
+        lr: Adam's learning rate.
+        lr_schedule: ``constant``, or ``cosine`` decay to zero at ``max_steps``.
+        init_from: ``.ckpt`` or published directory whose weights to start from (`dds_lightning.finetune`).
+        refit_normaliser: With ``init_from``, take the statistics of the new data, not the checkpoint's.
 
     Raises:
-        UserError: a setting outside its range; the message names it.
+        UserError: A setting outside its range; the message names it.
     """
+
+    STAGE = "clone"
+    PARTS: ClassVar = {"network": ("net",)}
+    SHAPE = ("hidden_dims",)
+    PREDICTION = "action"
 
     def __init__(
         self,
@@ -51,17 +55,21 @@ class BehaviourCloning(pl.LightningModule):
         hidden_dims: Sequence[int] = (256, 256),
         lr: float = 1e-3,
         lr_schedule: Literal["constant", "cosine"] = "cosine",
+        init_from: str | None = None,
+        refit_normaliser: bool = False,
     ) -> None:
         super().__init__()
         hidden_dims = list(hidden_dims)
-        if lr <= 0:
-            raise UserError(f"model.lr is {lr}, expected a positive number")
-        if any(width < 1 for width in hidden_dims):
-            raise UserError(f"model.hidden_dims is {hidden_dims}, expected widths of at least 1")
-        self.save_hyperparameters()
+        self.save_hyperparameters(ignore=["init_from"])
+        rules = [
+            ("lr", lr > 0, "a positive number"),
+            ("hidden_dims", all(width >= 1 for width in hidden_dims), "widths of at least 1"),
+        ]
+        self._refuse(rules)
         self.normaliser = Normaliser(observation_dim)
         self.action_box = ActionBox(action_dim)
         self.net = MLP(observation_dim, action_dim, hidden_dims)
+        self._begin(init_from)
 
     def unit_actions(self, observations: Tensor) -> Tensor:
         """Actions (..., A) in [-1, 1] for observations (..., O)."""
@@ -78,9 +86,10 @@ class BehaviourCloning(pl.LightningModule):
 
     def on_fit_start(self) -> None:
         """Take the data's statistics, unless a checkpoint brought them."""
+        datamodule: Any = getattr(self.trainer, "datamodule", None)
         if bool(self.normaliser.fitted):
+            refuse_other_box(self, datamodule)
             return
-        datamodule = getattr(self.trainer, "datamodule", None)
         if datamodule is None or not hasattr(datamodule, "statistics"):
             raise UserError(
                 "the clone has no observation statistics: fit it with a SegmentDataModule, or call "
@@ -93,25 +102,21 @@ class BehaviourCloning(pl.LightningModule):
     def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """One optimiser step's loss."""
         loss = self.loss(batch)
-        if self.global_step % LOG_EVERY == 0:
+        if is_log_step(self):
             self.log("train/loss", loss.detach())
         return loss
 
     def validation_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
-        """The same loss on episodes that were kept aside."""
+        """The same loss on held-out episodes."""
         self.log("val/loss", self.loss(batch), prog_bar=True, batch_size=len(batch["actions"]))
 
-    def configure_optimizers(self) -> Any:
-        """Adam over the network."""
-        settings = self.hparams
-        return adam(self.parameters(), settings["lr"], settings["lr_schedule"], 0, self)
+    def test_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
+        """As `validation_step`."""
+        self.log("test/loss", self.loss(batch), batch_size=len(batch["actions"]))
 
-    @classmethod
-    def load(cls, path: str | Path) -> Self:
-        """Load from a Lightning ``.ckpt`` or a published directory, in evaluation mode on the CPU."""
-        from dds_lightning.saving.checkpoint import load_module
-
-        return load_module(cls, path, part="clone")
+    def predict_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
+        """Actions (B H, A) for the steps of a batch."""
+        return self(batch["observations"]).flatten(0, 1)
 
 
 class CloneActor:
@@ -160,57 +165,39 @@ def fit_clone(
     hidden_dims: Sequence[int] = (256, 256),
     progress: bool = True,
 ) -> Path:
-    """Train the clone; goes on from `last.ckpt` if the directory holds one.
+    """Train the clone as `dds clone fit` does; goes on from `last.ckpt` if the directory holds one.
 
     Args:
-        task: that the data belong to.
-        data: as `SegmentDataModule` takes it, for example `local:DIR`.
-        directory: where logs and checkpoint go.
-        seed: of the weights, the split and the order of batches.
-        steps: optimiser steps.
-        batch_size: single steps of the data in a batch (segments of horizon 1).
-        lr: learning rate at the start.
-        hidden_dims: widths of the hidden layers.
-        progress: show a progress bar.
+        task: The task that the data belong to.
+        data: As `SegmentDataModule` takes it, for example `local:DIR`.
+        directory: Where logs and checkpoint go.
+        seed: Of the weights, the split and the order of batches.
+        steps: Optimiser steps.
+        batch_size: Single steps of the data in a batch.
+        lr: Learning rate at the start.
+        hidden_dims: Widths of the hidden layers.
+        progress: Show a progress bar.
 
     Returns:
         The checkpoint, which `CloneActor.load` reads.
 
     Raises:
-        UserError: data that do not fit, or a setting outside its range.
+        UserError: Data that do not fit, or a setting outside its range.
     """
-    from datamodules.segments import SegmentDataModule
-    from dds_lightning.callbacks.rolling import RollingCheckpoint
-    from dds_lightning.console import interrupts
-    from dds_lightning.rollout.play import torch_threads
-    from dds_lightning.training.stage_cli import quieten
-    from dds_lightning.training.trainer import trainer_settings
+    from dds_lightning.training.stage_cli import command
 
-    quieten()
     if steps < 1:
         raise UserError(f"steps is {steps}, expected at least 1")
-    directory = Path(directory)
-    module = SegmentDataModule(task.name, data, horizon=1, batch_size=batch_size, seed=seed)
-    module.setup()  # a mistake in the data comes before the first file
-    pl.seed_everything(seed, verbose=False)
-    clone = BehaviourCloning(task.observation_dim, task.action_dim, hidden_dims, lr)
-    settings: dict[str, Any] = {
-        "default_root_dir": str(directory),
-        "max_epochs": -1,
-        "max_steps": steps,
-        "devices": 1,
-        "check_val_every_n_epoch": None,
-        "val_check_interval": min(1000, steps),
-        "limit_val_batches": 10,
-        "num_sanity_val_steps": 0,
-        "log_every_n_steps": LOG_EVERY,
-        "enable_model_summary": False,
-        "enable_progress_bar": progress,
-    }
-    saving = RollingCheckpoint(str(directory))
-    trainer = pl.Trainer(**trainer_settings(settings, [saving]))
-    last = directory / "last.ckpt"
-    with interrupts.deferred(), torch_threads(1):
-        trainer.fit(clone, module, ckpt_path=last if last.is_file() else None, weights_only=True)
-    assert saving.path is not None
-    return saving.path
+    arguments = ["fit", "--config", "clone.yaml", f"--seed_everything={seed}", f"--data.task={task.name}"]
+    arguments += [f"--data.data={data}", f"--data.batch_size={batch_size}", f"--trainer.max_steps={steps}"]
+    arguments += [f"--trainer.val_check_interval={min(1000, steps)}", f"--trainer.enable_progress_bar={progress}"]
+    arguments += [
+        f"--model.lr={lr}",
+        f"--model.hidden_dims={list(hidden_dims)}",
+        "--trainer.enable_model_summary=false",
+    ]
+    arguments += [f"--trainer.default_root_dir={directory}", f"--checkpoint.dirpath={directory}"]
+    last = Path(directory) / "last.ckpt"
+    if last.is_file():
+        arguments.append(f"--ckpt_path={last}")
+    return Path(command("clone", arguments)().data["checkpoint"])

@@ -1,9 +1,9 @@
 """The command line `dds`. Nothing heavy is imported before the command is known.
 
-A function of `commands` is a command: its signature is the command line and its docstring the help. `dds
-skill` and `dds policy` are Lightning's own command lines (`fitting`). What a command returns is printed, as
-text for a person or, with `--json`, as one JSON document with nothing beside it on standard output; progress
-and logs go to standard error.
+A function of `commands` is a command: its signature is the command line and its docstring the help. `dds STAGE`, one
+for each training stage, is Lightning's own command line (`training.stage_cli`). What a command returns is printed, as
+text for a person or, with `--json`, as one JSON document with nothing beside it on standard output; progress and logs
+go to standard error.
 """
 
 import shlex
@@ -17,14 +17,11 @@ from dds_lightning._version import __version__
 from dds_lightning.console.interrupts import Interrupted, caught
 from dds_lightning.errors import UserError, is_out_of_memory, reason
 from dds_lightning.saving.files import DISK_ERRORS
+from dds_lightning.training.stages import STAGES
 
 USAGE_ERROR = 2
 GOES_ON = ("run", "relabel", "data collect", "data fetch")
 """Commands that find by themselves what an earlier call of theirs has done."""
-STAGES = {
-    "skill": "Stage one by itself: fit, validate, test or predict with the skill model.",
-    "policy": "Stage two by itself: fit, validate, test or predict with the policy.",
-}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -81,10 +78,10 @@ def _dispatch(words: list[str]) -> int:
 
 def _path(words: list[str]) -> list[str]:
     """The words that name a command: as many of the first as there are."""
-    from dds_lightning.cli.parser import COMMANDS
+    from dds_lightning.cli.parser import command_table
 
     path: list[str] = []
-    table: Any = COMMANDS
+    table: Any = command_table()
     for word in words:
         if not isinstance(table, Mapping) or word not in table:
             break

@@ -31,15 +31,13 @@ def run(
     workers: int | None = None,
     until: Literal["data", "skill", "relabel", "policy", "clone", "evaluate", "report"] = "report",
     fresh: bool = False,
-    skill: list[str] = [],  # noqa: B006 - jsonargparse shows the default and nobody changes it
-    policy: list[str] = [],  # noqa: B006
+    **stages: list[str],
 ) -> Report:
     """Do everything for one task: data, skills, relabelling, policy, baseline, evaluation, report.
 
     What is done is not done twice: call it again after an interruption and it goes on where it stopped;
-    change a setting and the stages that it touches are done again. Every setting of the two trainings can be
-    given as --skill.KEY=VALUE and --policy.KEY=VALUE, for example --skill.trainer.max_steps=500
-    --policy.model.alpha=5.
+    change a setting and the stages that it touches are done again. Every setting of a training stage can be given as
+    --STAGE.KEY=VALUE, for example --skill.trainer.max_steps=500 --policy.model.alpha=5.
 
     A task of several physics (`dds tasks NAME`) is played in the one in which the data were recorded.
 
@@ -70,8 +68,7 @@ def run(
         workers: processes for environments; without it one for every core
         until: the last stage to do
         fresh: do every stage again
-        skill: settings for `dds skill fit`, see above
-        policy: settings for `dds policy fit`, see above
+        **stages: settings for `dds STAGE fit` of each training stage, see above
     """
     from dds_lightning.pipeline.run import RunSettings, run_all
 
@@ -93,8 +90,7 @@ def run(
             workers=workers,
             until=until,
             fresh=fresh,
-            skill=tuple(skill),
-            policy=tuple(policy),
+            stages={name: tuple(arguments) for name, arguments in stages.items()},
         )
     )
 

@@ -7,37 +7,43 @@ from typing import Any
 import docstring_parser
 from jsonargparse import ArgumentParser
 
-from dds_lightning.cli import STAGES, atlas, checkpoints, commands, data
+from dds_lightning.cli import atlas, checkpoints, commands, data
 from dds_lightning.errors import UserError
+from dds_lightning.training.stages import STAGES
 
 Commands = Mapping[str, Any]  # name -> function, a group of commands, or None for one of Lightning's
 
-COMMANDS: Commands = {
-    "run": commands.run,
-    "skill": None,
-    "policy": None,
-    "relabel": commands.relabel,
-    "evaluate": commands.evaluate,
-    "report": commands.report,
-    "atlas": atlas.atlas,
-    "data": {
-        "list": data.list_,
-        "show": data.show,
-        "check": commands.data_check,
-        "fetch": data.fetch,
-        "collect": data.collect,
-    },
-    "tasks": commands.tasks,
-    "publish": checkpoints.publish,
-    "checkpoints": {"list": checkpoints.list_, "verify": checkpoints.verify},
-    "export": checkpoints.export,
-}
 GROUPS = {
     "data": "List, show, check, fetch and collect data sets.",
     "checkpoints": "List and verify published agents.",
 }
 OPTIONAL_WORDS = {commands.tasks: "name"}
 """Functions with a parameter that has a default and is typed without its name all the same."""
+TAKES_STAGES = (commands.run,)
+"""Functions that take the arguments of each training stage as a keyword of its name."""
+
+
+def command_table() -> Commands:
+    """The commands by their names, in the order in which the help lists them."""
+    return {
+        "run": commands.run,
+        **dict.fromkeys(STAGES),
+        "relabel": commands.relabel,
+        "evaluate": commands.evaluate,
+        "report": commands.report,
+        "atlas": atlas.atlas,
+        "data": {
+            "list": data.list_,
+            "show": data.show,
+            "check": commands.data_check,
+            "fetch": data.fetch,
+            "collect": data.collect,
+        },
+        "tasks": commands.tasks,
+        "publish": checkpoints.publish,
+        "checkpoints": {"list": checkpoints.list_, "verify": checkpoints.verify},
+        "export": checkpoints.export,
+    }
 
 
 def build_parser() -> tuple[ArgumentParser, dict[str, Callable[..., Any]]]:
@@ -49,7 +55,7 @@ def build_parser() -> tuple[ArgumentParser, dict[str, Callable[..., Any]]]:
         exit_on_error=False,
     )
     functions: dict[str, Callable[..., Any]] = {}
-    _add(parser, COMMANDS, functions)
+    _add(parser, command_table(), functions)
     return parser, functions
 
 
@@ -57,7 +63,7 @@ def _add(parser: ArgumentParser, table: Commands, functions: dict[str, Callable[
     subcommands = parser.add_subcommands(required=True, metavar="COMMAND")
     for name, entry in table.items():
         if entry is None:
-            subcommands.add_subcommand(name, ArgumentParser(exit_on_error=False), help=STAGES[name])
+            subcommands.add_subcommand(name, ArgumentParser(exit_on_error=False), help=STAGES[name].description)
         elif isinstance(entry, Mapping):
             group = ArgumentParser(description=GROUPS[name], exit_on_error=False)
             subcommands.add_subcommand(name, group, help=GROUPS[name])  # before its own: jsonargparse's order
@@ -74,6 +80,8 @@ def _add(parser: ArgumentParser, table: Commands, functions: dict[str, Callable[
             leaf.add_function_arguments(
                 entry, as_group=False, as_positional=True, skip={optional} if optional else None
             )
+            for stage in STAGES if entry in TAKES_STAGES else ():
+                leaf.add_argument(f"--{stage}", type=list[str], default=[], help=f"Settings for `dds {stage} fit`")
             subcommands.add_subcommand(name, leaf, help=first)
             functions[prefix + name] = entry
 
@@ -102,7 +110,7 @@ def prepare(words: list[str]) -> list[str]:
     """
     flags = {
         f"--{name}"
-        for function in _functions(COMMANDS)
+        for function in _functions(command_table())
         for name, parameter in inspect.signature(function).parameters.items()
         if parameter.default is False
     }

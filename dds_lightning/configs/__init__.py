@@ -14,9 +14,9 @@ RUN_DEFAULTS: dict[str, Any] = {
     "clone_steps": 4000,
     "selection": "sample",
     "temperature": 1.0,
-    "noise_scale": None,  # the skill model's own
+    "noise_scale": None,  # the skill model's
 }
-"""What a preset's `run.yaml` may set, and what holds without it."""
+"""What a preset's `run.yaml` may set, with the defaults."""
 
 
 def packaged() -> list[str]:
@@ -25,10 +25,10 @@ def packaged() -> list[str]:
 
 
 def find(name: str) -> Path:
-    """Find a configuration: a file of the user's, or else a packaged one.
+    """Find a configuration: the user's file, or else a packaged one.
 
     Raises:
-        UserError: neither exists.
+        UserError: Neither exists.
     """
     for path in (Path(name), ROOT / name, ROOT / f"{name}.yaml"):
         if path.is_file():
@@ -36,40 +36,26 @@ def find(name: str) -> Path:
     raise UserError(f"--config: there is no file {name}, and the packaged ones are {', '.join(packaged())}")
 
 
-def find_preset(name: str) -> dict[str, Path]:
-    """Both configurations of a preset: a packaged folder's name or a folder of the user's.
-
-    Raises:
-        UserError: neither exists, or one of the two files is missing.
-    """
-    folder = _preset_folder(name)
-    pair = {stage: folder / f"{stage}.yaml" for stage in ("skill", "policy")}
-    for path in pair.values():
-        if not path.is_file():
-            raise UserError(f"preset: folder {folder} has no {path.name}")
-    return pair
-
-
 def run_defaults(name: str) -> dict[str, Any]:
-    """What a preset says about `dds run` beside its two trainings; the file `run.yaml` may be missing.
+    """What a preset says about `dds run` apart from its trainings; it need not have a `run.yaml`.
 
     Args:
-        name: as for `find_preset`.
+        name: As for `preset_folder`.
 
     Returns:
         A value for each of `RUN_DEFAULTS`.
 
     Raises:
-        UserError: there is no such preset, or its `run.yaml` holds something else.
+        UserError: There is no such preset, or its `run.yaml` is not a mapping of these settings.
     """
-    path = _preset_folder(name) / "run.yaml"
+    path = preset_folder(name) / "run.yaml"
     try:
         chosen = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else {}
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UserError(f"preset: {path} is no YAML: {' '.join(str(error).split())}") from error
+        raise UserError(f"preset: {path} is not valid YAML: {' '.join(str(error).split())}") from error
     known = ", ".join(RUN_DEFAULTS)
     if not isinstance(chosen, dict):
-        raise UserError(f"preset: {path} holds no settings, expected some of {known}")
+        raise UserError(f"preset: {path} is not a mapping, expected some of {known}")
     for key, value in chosen.items():
         if key not in RUN_DEFAULTS:
             raise UserError(f"preset: {path} sets {key}, expected only {known}")
@@ -80,10 +66,15 @@ def run_defaults(name: str) -> dict[str, Any]:
     return {**RUN_DEFAULTS, **chosen}
 
 
-def _preset_folder(name: str) -> Path:
+def preset_folder(name: str) -> Path:
+    """The folder of a preset: a packaged one's name or a folder of the user's.
+
+    Raises:
+        UserError: There is none.
+    """
     folder = Path(name) if Path(name).is_dir() else ROOT / name
     if not folder.is_dir():
-        known = ", ".join(sorted({Path(entry).parent.name for entry in packaged()}))
+        known = ", ".join(sorted({Path(entry).parent.name for entry in packaged() if "/" in entry}))
         raise UserError(f"preset: there is no folder {name}, and the packaged ones are {known}")
     return folder
 

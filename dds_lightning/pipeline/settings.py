@@ -1,14 +1,20 @@
-"""What `dds run` was asked to do, and what that means for its two trainings: their words and their settings."""
+"""What `dds run` was asked to do, and what that means for its trainings: their arguments and their settings."""
 
 import json
 import shlex
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dds_lightning.configs import RUN_DEFAULTS, find_preset, run_defaults
+from jsonargparse import Namespace
+
+from dds_lightning.configs import RUN_DEFAULTS, run_defaults
+from dds_lightning.console.reports import Report
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import Task, get_task
+from dds_lightning.training.stage_cli import StageCLI, command_line, parsed
+from dds_lightning.training.stages import STAGES, preset_configs
 
 WATCH_EPISODES = 10
 """Episodes of each evaluation while the policy trains."""
@@ -35,21 +41,21 @@ class RunSettings:
     workers: int | None = None
     until: str = "report"
     fresh: bool = False
-    skill: tuple[str, ...] = ()
-    policy: tuple[str, ...] = ()
+    stages: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Training stage -> arguments for its `fit`, as a user gave them."""
 
     @classmethod
     def with_preset(cls, task: str, out: Path, preset: str | None = None, **asked: Any) -> "RunSettings":
         """Settings in which the preset fills in what is None and `run_defaults` knows.
 
         Args:
-            task: name of a task.
-            out: folder of the run.
-            preset: as in `dds run`; None takes the task family's.
-            **asked: the other settings.
+            task: Name of a task.
+            out: Folder of the run.
+            preset: As in `dds run`; None takes the task family's.
+            **asked: The other settings.
 
         Raises:
-            UserError: there is no such task or preset, or the preset's `run.yaml` holds something else.
+            UserError: There is no such task or preset, or the preset's `run.yaml` holds something else.
         """
         defaults = run_defaults(preset or get_task(task).family)
         missing = {name: value for name, value in defaults.items() if asked.get(name) is None}
@@ -58,103 +64,176 @@ class RunSettings:
     def command(self) -> str:
         """The command line that makes the same run again, `--out` aside."""
         usual = RunSettings.with_preset(self.task, self.out, self.preset)
-        words = ["dds", "run", self.task, f"--seed={self.seed}"]
+        arguments = ["dds", "run", self.task, f"--seed={self.seed}"]
         for name in ("data", "preset", *RUN_DEFAULTS, "evaluate_every", "episodes", "episodes_per_skill"):
             value = getattr(self, name)
             if value != getattr(usual, name) or (name == "preset" and value):
-                words.append(f"--{name}={value}")
-        words += [
-            f"--{stage}.{word.removeprefix('--')}" for stage in ("skill", "policy") for word in getattr(self, stage)
-        ]
-        return shlex.join(words)
+                arguments.append(f"--{name}={value}")
+        arguments += [f"--{stage}.{one.removeprefix('--')}" for stage in STAGES for one in self.stages.get(stage, ())]
+        return shlex.join(arguments)
 
 
 class Trainings:
-    """The commands `dds skill fit` and `dds policy fit` of a run.
-
-    Making one parses both commands, so that a wrong setting is found before data are collected.
+    """The commands `dds STAGE fit` of a run, each parsed once, so that a wrong setting is found before data are made.
 
     Args:
-        wanted: what was asked for.
-        task: in the variant that the data come from.
+        wanted: What was asked for.
+        task: In the variant that the data come from.
 
     Attributes:
-        settings: stage -> all settings, defaults included.
-        evaluate_every: steps between two evaluations while the policy trains; 0 for none.
+        evaluate_every: Steps between two evaluations while the policy trains; 0 for none.
 
     Raises:
-        UserError: a preset, an interval or words that cannot work.
+        UserError: A preset, an interval or arguments that cannot work.
     """
 
     def __init__(self, wanted: RunSettings, task: Task) -> None:
-        from dds_lightning.training.stage_cli import settings_of
-
         self.wanted, self.task = wanted, task
-        self.preset = find_preset(wanted.preset or task.family)
-        self.evaluate_every = 0
+        self.preset = preset_configs(wanted.preset or task.family)
+        # How often the policy is evaluated follows from its steps, which only its parsed settings say.
+        self.evaluate_every = self._asked_interval()
         spec = wanted.data or "local:."
-        self.settings = {stage: settings_of(stage, self.words(stage, spec)) for stage in ("skill", "policy")}
-        self.evaluate_every = self._interval(self.settings["policy"]["trainer"]["max_steps"])
-        if self.evaluate_every:
-            self.settings["policy"] = settings_of("policy", self.words("policy", spec))
+        self._parsed = {stage: parsed(stage, self.arguments(stage, spec)) for stage in STAGES}
+        self._settle_interval()
 
-    def _interval(self, steps: int) -> int:
-        """By default four evaluations; none on PointMaze, where the last checkpoint is as good as any."""
+    # ---------------------------------------------------------------- evaluating while the policy trains
+
+    def _asked_interval(self) -> int:
+        """The interval that was asked for; by default 1 stands for one to be settled, and none on PointMaze."""
         every = self.wanted.evaluate_every
-        if every is None:
-            wanted = self.task.family != "pointmaze" and steps > 0
-            return max(1, steps // 4) if wanted else 0
-        if every < 0 or 0 < steps < every:
+        return (0 if self.task.family == "pointmaze" else 1) if every is None else every
+
+    def _settle_interval(self) -> None:
+        """By default four evaluations; none on PointMaze, where the last checkpoint is as good as any."""
+        settings = self._parsed["policy"].settings
+        steps, every = settings.trainer.max_steps, self.evaluate_every
+        if self.wanted.evaluate_every is None and every:
+            every = max(1, steps // 4) if steps > 0 else 0
+        elif every < 0 or 0 < steps < every:
             raise UserError(f"--evaluate_every is {every}, expected 0 (never) to {steps}, the steps of the policy")
-        return every
-
-    def words(self, stage: str, spec: str, skill: Path | None = None) -> list[str]:
-        """The words of `dds STAGE fit`.
-
-        Args:
-            stage: "skill" or "policy".
-            spec: the data.
-            skill: checkpoint of the skills, for the policy; without it where it will be.
-        """
-        w, folder = self.wanted, self.wanted.out / stage
-        words = ["fit", "--config", str(self.preset[stage])]
-        words += [f"--seed_everything={w.seed}", f"--data.seed={w.seed}"]
-        words += [f"--data.task={self.task.name}", f"--data.data={spec}"]
-        if stage == "policy":
-            checkpoint = skill or w.out / "skill" / "last.ckpt"
-            words += [f"--data.skill={checkpoint}", f"--data.cache={w.out / 'relabel'}", *self._watching()]
-        words += [f"--trainer.default_root_dir={folder}", f"--checkpoint.dirpath={folder}"]
-        return [*words, "--trainer.enable_model_summary=false", *getattr(w, stage)]
+        if every != self.evaluate_every:
+            watching = self._watching_callback(settings)
+            if every:
+                watching.init_args.every_n_steps = settings.best.every_n_steps = every
+            else:
+                settings.trainer.callbacks.remove(watching)
+                settings.best.monitor = settings.best.every_n_steps = None
+        self.evaluate_every = every
 
     def _watching(self) -> list[str]:
-        """The words that make the policy's training evaluate and keep its best checkpoint."""
-        every = self.evaluate_every
+        """The arguments that make the policy's training evaluate and keep its best checkpoint."""
+        every, wanted = self.evaluate_every, self.wanted
         if not every:
             return []
+        chosen: dict[str, Any] = {"episodes": WATCH_EPISODES, "every_n_steps": every}
         # Other starts than those of the final table: the best is not scored by the episodes that chose it.
-        chosen: dict[str, Any] = {"episodes": WATCH_EPISODES, "every_n_steps": every, "seed": self.wanted.seed + 1}
-        chosen["workers"] = self.wanted.workers
+        chosen |= {"seed": wanted.seed + 1, "workers": wanted.workers}
+        chosen |= {"selections": [wanted.selection], "temperature": wanted.temperature}
+        chosen |= {"noise_scale": wanted.noise_scale}
         callback = {"class_path": "dds_lightning.callbacks.RolloutEvaluation", "init_args": chosen}
-        words = [f"--trainer.callbacks+={json.dumps(callback)}"]
-        return [*words, "--best.monitor=rollout/score", f"--best.every_n_steps={every}"]
+        arguments = [f"--trainer.callbacks+={json.dumps(callback)}"]
+        return [*arguments, "--best.monitor=rollout/score", f"--best.every_n_steps={every}"]
 
-    def essence(self, stage: str) -> dict[str, Any]:
+    def _watching_callback(self, settings: Namespace) -> Any:
+        """The callback of `_watching` among those of the policy; the user's own come after it."""
+        episodes_seed = (WATCH_EPISODES, self.wanted.seed + 1)
+        return next(
+            callback
+            for callback in settings.trainer.callbacks
+            if callback.class_path.endswith("RolloutEvaluation")
+            and (callback.init_args.episodes, callback.init_args.seed) == episodes_seed
+        )
+
+    # ---------------------------------------------------------------- arguments and settings
+
+    def arguments(self, stage: str, spec: str, skill: Path | None = None) -> list[str]:
+        """The arguments of `dds STAGE fit`.
+
+        Args:
+            stage: Name of a training stage.
+            spec: The data.
+            skill: Checkpoint of the skills, for the policy; None stands for where it will be.
+        """
+        wanted, folder = self.wanted, self.wanted.out / stage
+        config = self.preset[stage]
+        arguments = ["fit", *(["--config", str(config)] if config else [])]
+        arguments += [f"--seed_everything={wanted.seed}", f"--data.seed={wanted.seed}"]
+        arguments += [f"--data.task={self.task.name}", f"--data.data={spec}"]
+        if stage == "policy":
+            checkpoint = skill or wanted.out / "skill" / "last.ckpt"
+            arguments += [f"--data.skill={checkpoint}", f"--data.cache={wanted.out / 'relabel'}", *self._watching()]
+        if stage == "clone":
+            steps = wanted.clone_steps
+            arguments += [f"--trainer.max_steps={steps}", f"--trainer.val_check_interval={min(1000, steps)}"]
+        arguments += [f"--trainer.default_root_dir={folder}", f"--checkpoint.dirpath={folder}"]
+        return [*arguments, "--trainer.enable_model_summary=false", *wanted.stages.get(stage, ())]
+
+    def settings(self, stage: str) -> dict[str, Any]:
+        """All settings of a training, defaults included."""
+        return self._parsed[stage].dump()
+
+    def cache_key_settings(self, stage: str) -> dict[str, Any]:
         """The settings that a training's result depends on: all of them but places of files and processes."""
-        config = self.settings[stage]
+        config = self.settings(stage)
         trainer = {key: value for key, value in config["trainer"].items() if key not in _PLACES}
         if isinstance(trainer.get("callbacks"), list):
-            trainer["callbacks"] = [_without_workers(callback) for callback in trainer["callbacks"]]
+            trainer["callbacks"] = [_without(callback, "workers") for callback in trainer["callbacks"]]
         data = {key: value for key, value in config["data"].items() if key not in ("data", "skill", "cache")}
         best = {key: value for key, value in config["best"].items() if key != "every_n_steps" or value is not None}
         chosen = {"trainer": trainer, "model": config["model"], "data": data, "best": best}
         return {"seed": config["seed_everything"], **chosen}
 
+    def former_settings(self, stage: str) -> dict[str, Any]:
+        """`cache_key_settings` as version 0.1.0 wrote them, so that what it finished is still found done.
+
+        It trained the clone without a configuration, and chose the policy's best checkpoint by sampled codes with the
+        decoder's own noise, however the run acts.
+        """
+        if stage == "clone":
+            wanted = self.wanted
+            asked = {"arguments": list(asked)} if (asked := wanted.stages.get(stage)) else {}
+            return {"task": self.task.name, "seed": wanted.seed, "steps": wanted.clone_steps, **asked}
+        settings = self.cache_key_settings(stage)
+        for callback in settings["trainer"]["callbacks"] or [] if stage == "policy" and self.evaluate_every else []:
+            if callback["init_args"].get("seed") == self.wanted.seed + 1:
+                callback["init_args"] |= {"selections": ["sample"], "temperature": 1.0, "noise_scale": None}
+        return settings
+
     def relabelling(self) -> dict[str, Any]:
         """The settings of relabelling, which are the policy's data's."""
+        data = self._parsed["policy"].settings.data
         names = ("gamma", "discount", "stride", "reward_scale", "reward_shift")
-        return {name: self.settings["policy"]["data"][name] for name in names}
+        return {name: data[name] for name in names}
+
+    # ---------------------------------------------------------------- doing it
+
+    def command(self, stage: str, spec: str, skill: Path | None, resume: Path | None) -> str:
+        """The command line that `fit` with the same arguments is."""
+        arguments = self.arguments(stage, spec, skill)
+        if resume is not None:
+            arguments += [f"--ckpt_path={resume}", "--model.init_from=null"]
+        return command_line(stage, arguments)
+
+    def fit(self, stage: str, spec: str, skill: Path | None = None, resume: Path | None = None) -> Report:
+        """Run `dds STAGE fit`.
+
+        Args:
+            stage: Name of a training stage.
+            spec: The data.
+            skill: Checkpoint of the skills, for the policy.
+            resume: Checkpoint to go on from.
+        """
+        cli: StageCLI = self._parsed[stage]
+        cli.settings.data.data = spec
+        if skill is not None:
+            cli.settings.data.skill = str(skill)
+        if resume is not None:
+            if "init_from" in cli.settings.model:
+                cli.settings.model.init_from = None
+            cli.resume(resume)
+        return cli.build().execute()
 
 
-def _without_workers(callback: dict[str, Any]) -> dict[str, Any]:
-    chosen = {key: value for key, value in callback.get("init_args", {}).items() if key != "workers"}
+def _without(callback: dict[str, Any], name: str) -> dict[str, Any]:
+    chosen = {key: value for key, value in callback.get("init_args", {}).items() if key != name}
     return {**callback, "init_args": chosen}

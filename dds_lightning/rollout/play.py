@@ -93,7 +93,7 @@ def rollout(
         count = sum(plan.contestant.episodes for plan in plans)
         report = stack.enter_context(_mean_so_far(count, progress, "success" if task.measures_success else "score"))
         match = _Match(pool, plans, seed, record or record_observations, record_observations, report)
-        stack.enter_context(torch_threads(threads))
+        stack.enter_context(_torch_threads(threads))
         rows = match.play(take_seats(bundles, plans, seed))
     order = {contestant.name: i for i, contestant in enumerate(contestants)}
     rows.sort(key=lambda row: (order[row["actor"]], row["episode"]))
@@ -227,8 +227,8 @@ class _Match:
 
 
 @contextlib.contextmanager
-def torch_threads(count: int) -> Iterator[None]:
-    """Let torch use `count` threads inside the block; small networks gain little from more, and lose on busy cores."""
+def _torch_threads(count: int) -> Iterator[None]:
+    """Let torch use `count` threads inside the block."""
     import torch
 
     before = torch.get_num_threads()

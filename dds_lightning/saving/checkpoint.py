@@ -9,6 +9,7 @@ import errno
 import os
 import pickle
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -25,6 +26,10 @@ from dds_lightning.saving.published import publish as publish
 FORMAT = 1
 FORMAT_KEY = "dds_format"
 """Entry of a `.ckpt` that holds its version; files of before it have none and are of the first."""
+
+STAGE_KEY = "stage"
+"""Entry of a `.ckpt` that holds the name of the training stage; older files are known by a setting of theirs."""
+_TELLTALES = {"tau": "policy", "horizon": "skill", "action_dim": "clone"}
 
 M = TypeVar("M", bound=nn.Module)
 
@@ -95,6 +100,13 @@ def load_ckpt(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise UserError(f"{path} is not a Lightning checkpoint: it has no state_dict")
     refuse_newer(path, checkpoint.get(FORMAT_KEY, FORMAT), FORMAT)
     return checkpoint
+
+
+def stage_of(checkpoint: Mapping[str, Any]) -> str | None:
+    """The training stage that wrote a checkpoint; None where nothing says it."""
+    settings = checkpoint.get("hyper_parameters") or {}
+    older = next((stage for setting, stage in _TELLTALES.items() if setting in settings), None)
+    return checkpoint.get(STAGE_KEY) or older
 
 
 def _write(checkpoint: dict[str, Any], path: Path) -> None:

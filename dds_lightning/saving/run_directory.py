@@ -1,17 +1,16 @@
-"""A run directory that knows what is done: stages with markers, skipped, resumed or redone.
+"""A run directory that knows what has been done: steps with markers, which are skipped, resumed or redone.
 
 ```
  runs/TASK/
    run.lock              held while a `dds run` works here
-   STAGE/…               what the stage wrote
-   STAGE/stage.json      state, settings, fingerprint of its inputs and outputs, seconds
-   previous/STAGE/…      the last result that other settings replaced
+   STEP/…                what the step wrote
+   STEP/stage.json       state, settings, hashes of its inputs and outputs, seconds
+   previous/STEP/…       the last result that other settings replaced
 ```
 
-A stage is *done* when its marker says so, its settings and the outputs of the stages it reads from are the
-same as now, and its own outputs are still there. It is *resumed* when it was started with exactly these
-settings and inputs and not finished. In every other case what lies there moves to `previous/` and it starts
-anew.
+A step is *done* when its marker says so, its settings and the outputs of the steps it reads have not changed, and its
+own outputs are still there. It is *resumed* when it was started with exactly these settings and inputs and did not
+finish. Otherwise what is there moves to `previous/` and the step starts over.
 """
 
 import fcntl
@@ -20,7 +19,7 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -38,16 +37,16 @@ Work = Callable[[Path, bool], Mapping[str, Any]]
 
 @dataclass
 class Done:
-    """A finished stage.
+    """A finished step.
 
     Attributes:
-        name: of the stage.
-        folder: where its files are.
-        outputs: name -> path of what the next stages read.
-        facts: small results worth keeping in the marker; the same for the same outputs.
-        digest: of outputs and facts; the next stages' markers hold it.
-        seconds: that the work took, interruptions left out.
-        skipped: whether it had been done before.
+        name: Name of the step.
+        folder: Where its files are.
+        outputs: Name -> path of what later steps read.
+        facts: Small results worth keeping in the marker; the same for the same outputs.
+        digest: Hash of outputs and facts, which the markers of later steps hold.
+        seconds: How long the work took, not counting interruptions.
+        skipped: Whether it had been done before.
     """
 
     name: str
@@ -59,37 +58,46 @@ class Done:
     skipped: bool = False
 
 
-class Stages:
-    """The stages of one run directory.
+class RunDirectory:
+    """The steps of one run directory.
 
     Args:
-        root: the run directory.
-        console: where progress is told.
-        fresh: take nothing for done.
+        root: The run directory.
+        console: Where progress is printed.
+        fresh: Do everything again.
     """
 
     def __init__(self, root: Path, console: Console, fresh: bool = False) -> None:
         self.root, self.console, self.fresh = root, console, fresh
         self.done: list[Done] = []
 
-    def do(self, name: str, title: str, settings: Mapping[str, Any], reads: list[Done], work: Work) -> Done:
-        """Do one stage, or find it done.
+    def do(
+        self,
+        name: str,
+        title: str,
+        settings: Mapping[str, Any],
+        reads: Sequence[Done],
+        work: Work,
+        former: Mapping[str, Any] | None = None,
+    ) -> Done:
+        """Do one step, or find that it is done.
 
         Args:
-            name: of the stage and its folder.
-            title: what a person reads while it runs.
-            settings: everything that its result depends on, apart from `reads`; JSON values.
-            reads: the stages whose outputs it uses.
-            work: called with (folder, resuming); returns outputs (values that are paths in the folder) and
-                facts.
+            name: Name of the step and its folder.
+            title: What a person reads while it runs.
+            settings: Everything that its result depends on apart from `reads`; JSON values.
+            reads: The steps whose outputs it uses.
+            work: Called with (folder, resuming); returns outputs (values that are paths in the folder) and facts.
+            former: `settings` as an earlier version wrote them, which count as the same.
 
         Raises:
-            UserError: a newer version of this package did the stage; nothing is touched.
+            UserError: A newer version of this package did the step; nothing is touched.
         """
         folder = self.root / name
         expected = {"settings": _json(settings), "inputs": {stage.name: stage.digest for stage in reads}}
         marker = read_marker(folder)
-        same = {key: marker.get(key) for key in expected} == expected
+        there = {key: marker.get(key) for key in expected}
+        same = there in (expected, {**expected, "settings": _json(settings if former is None else former)})
         if same and marker.get("state") == "finished" and not self.fresh and (found := _found(folder, marker)):
             self._say(f"{title}: done before, in {duration(found.seconds)}", "dim")
             self.done.append(found)
@@ -139,7 +147,7 @@ def locked(root: Path) -> Iterator[None]:
     """Keep a second `dds run` out of the directory while this one works.
 
     Raises:
-        UserError: somebody else is working there, or it is no folder.
+        UserError: Another run is working there, or it is not a folder.
     """
     if root.exists() and not root.is_dir():
         raise UserError(f"out: {root} is a file, expected a folder for the run")
@@ -162,7 +170,7 @@ def locked(root: Path) -> Iterator[None]:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON so that a reader sees the old file or the new one, and never half of one."""
+    """Write JSON atomically: a reader sees the old file or the new one."""
     text = json.dumps(value, indent=2, allow_nan=False)
     with written_whole(path) as part:
         part.write_text(text, encoding="utf-8")
@@ -178,10 +186,10 @@ def duration(seconds: float) -> str:
 
 
 def read_marker(folder: Path) -> dict[str, Any]:
-    """The marker of a stage's folder; empty where there is none, or a damaged one.
+    """The marker in a step's folder; empty if it is missing or damaged.
 
     Raises:
-        UserError: a newer version of this package wrote it.
+        UserError: A newer version of this package wrote it.
     """
     try:
         value = json.loads((folder / MARKER).read_text(encoding="utf-8"))
@@ -194,7 +202,7 @@ def read_marker(folder: Path) -> dict[str, Any]:
 
 
 def _found(folder: Path, marker: dict[str, Any]) -> Done | None:
-    """The stage as it was finished, if its outputs are all as they were."""
+    """The step as it was finished, if none of its outputs has changed."""
     outputs = {key: folder / relative for key, relative in marker["outputs"].items()}
     if any(not path.exists() or _digest(path) != marker["files"][key] for key, path in outputs.items()):
         return None
@@ -228,7 +236,7 @@ def _put_away(folder: Path, previous: Path) -> None:
 
 
 def _difference(marker: dict[str, Any], expected: dict[str, Any]) -> str:
-    """In a few words, why a stage is done again."""
+    """Why a step is done again, in a few words."""
     old, new = _flat(marker.get("settings") or {}), _flat(expected["settings"])
     changed = [name for name in {**old, **new} if old.get(name) != new.get(name)]
     if changed:

@@ -1,92 +1,68 @@
-"""`dds skill` and `dds policy`: Lightning's command line over our modules, with its traps closed.
+"""`dds STAGE`: Lightning's command line over a stage's module and data, with its traps closed.
 
 - Dimensions come from the data (`data.observation_dim` -> `model.observation_dim`), never from the user.
 - `--ckpt_path` continues a training. The settings of the model, of the data and the seed come from the checkpoint;
-  naming another value for one of them is refused instead of being ignored.
+  giving another value for one of them is refused instead of being ignored.
+- `data.seed` follows `--seed_everything` unless it is given.
 - A mistake in the data is found before the first file is written.
 """
 
-import logging
 import shlex
-import signal
-import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
 import torch
+import yaml
 from jsonargparse import ArgumentError, Namespace
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
-from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from dds_lightning.callbacks.best import BestCheckpoint
 from dds_lightning.callbacks.rolling import RollingCheckpoint
 from dds_lightning.configs import resolve_configs
-from dds_lightning.console import interrupts
 from dds_lightning.console.reports import Report, table
-from dds_lightning.errors import UserError, is_out_of_memory, reason
-from dds_lightning.saving.checkpoint import load_ckpt
+from dds_lightning.errors import UserError
+from dds_lightning.finetune import read
+from dds_lightning.saving.checkpoint import load_ckpt, stage_of
 from dds_lightning.saving.files import short
-from dds_lightning.training.trainer import KeptSettings, trainer_settings
+from dds_lightning.training.fit import advice_on_memory, fit, quieten
+from dds_lightning.training.stages import get_stage
+from dds_lightning.training.trainer import TrainingSettings, trainer_settings
 
-DESCRIPTION = {
-    "skill": "Stage one: learn discrete skills from segments of trajectories.",
-    "policy": "Stage two: learn from relabelled data when to use which skill.",
-}
-STEPS = {"skill": 500_000, "policy": 1_500_000}  # the paper's, as are the defaults of the modules
-LINKS = {
-    "skill": ("observation_dim", "action_dim", "horizon"),
-    "policy": ("observation_dim", "num_skills", "skill_hash"),
-}
 PLACES = ("data", "skill", "relabelled", "cache", "device_resident")
 """Settings of the data that say where they are; a training may go on with them elsewhere."""
 
 
-def modules(stage: str) -> tuple[type[pl.LightningModule], type[pl.LightningDataModule]]:
-    """The model and the data of a stage."""
-    if stage == "skill":
-        from datamodules.segments import SegmentDataModule
-        from dds_lightning.skill import SkillModule
-
-        return SkillModule, SegmentDataModule
-    from datamodules.relabelled import RelabeledDataModule
-    from dds_lightning.policy import PolicyModule
-
-    return PolicyModule, RelabeledDataModule
-
-
 class StageCLI(LightningCLI):
-    """The command line of one stage; `execute` runs the subcommand, so that parsing and work are apart.
+    """The command line of one stage. Making one parses; `build` makes the objects; `execute` runs the subcommand.
 
     Args:
-        stage: `skill` or `policy`.
-        words: what follows `dds skill`.
-        parse_only: stop after parsing; `config` holds the settings.
+        stage: Name of a registered stage.
+        arguments: What follows `dds STAGE`.
+        parse_only: Only the settings are wanted: no checkpoint is read to complete them.
     """
 
-    def __init__(self, stage: str, words: Sequence[str], parse_only: bool = False) -> None:
-        self.stage = stage
+    def __init__(self, stage: str, arguments: Sequence[str], parse_only: bool = False) -> None:
+        self.stage = get_stage(stage)
         self.parse_only = parse_only
-        self.words = resolve_configs(words)
+        self.arguments = resolve_configs(arguments)
         self.checkpoint: dict[str, Any] | None = None
-        self.result: Report | None = None
         parser = {"exit_on_error": False}
-        module, datamodule = modules(stage)
         super().__init__(
-            module,
-            datamodule,
-            args=self.words,
+            self.stage.module_class(),
+            self.stage.data_class(),
+            args=self.arguments,
             save_config_kwargs={"overwrite": True},
             seed_everything_default=0,
             trainer_defaults={
                 "default_root_dir": f"runs/{stage}",
                 "max_epochs": -1,
-                "max_steps": STEPS[stage],
+                "max_steps": self.stage.steps,
             },
             parser_kwargs={
                 "prog": f"dds {stage}",
-                "description": DESCRIPTION[stage],
+                "description": self.stage.description,
                 **parser,
                 **dict.fromkeys(self.subcommands(), parser),
             },
@@ -101,7 +77,7 @@ class StageCLI(LightningCLI):
         parser.add_lightning_class_args(RollingCheckpoint, "checkpoint")
         parser.add_lightning_class_args(BestCheckpoint, "best")
         parser.add_argument("--json", action="store_true", help="print one JSON document and nothing else")
-        for name in LINKS[self.stage]:
+        for name in self.stage.links:
             parser.link_arguments(f"data.{name}", f"model.{name}", apply_on="instantiate")
 
     @staticmethod
@@ -110,33 +86,55 @@ class StageCLI(LightningCLI):
         return {name: {*skip, "weights_only"} for name, skip in LightningCLI.subcommands().items()}
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
-        """Parse the words given to us and never those of the process."""
+        """Parse the arguments given to us and never those of the process."""
         self.config = parser.parse_args(args)
+        data = self.settings.data
+        if "seed" in data and data.seed is None:
+            data.seed = int(self.settings.seed_everything)
+
+    @property
+    def settings(self) -> Namespace:
+        """The settings of the subcommand; what is changed here before `build` counts."""
+        chosen: Namespace = self.config[self.config.subcommand]
+        return chosen
+
+    def dump(self) -> dict[str, Any]:
+        """All settings, defaults included, as plain values: what `--print_config` prints."""
+        parser = self._parser(self.config.subcommand)
+        return yaml.safe_load(parser.dump(self.settings, skip_unset=False, skip_validation=True))
 
     def _parse_ckpt_path(self) -> None:
-        """Take what shaped the training from the checkpoint, and refuse to contradict it."""
-        settings = self.config[self.config.subcommand]
-        path = settings.get("ckpt_path")
-        if path is None:
-            if self.config.subcommand != "fit" and not self.parse_only:
-                raise UserError(
-                    f"--ckpt_path is missing: `dds {self.stage} {self.config.subcommand}` needs a checkpoint"
-                )
-            if settings.model.get("init_from") is not None and not self.parse_only:
-                self._take_shape(settings.model)
-            return
+        """Complete the settings from the checkpoint that is named, if one is."""
+        settings = self.settings
+        if settings.get("ckpt_path") is not None:
+            self.resume(settings.ckpt_path)
+        elif self.config.subcommand != "fit" and not self.parse_only:
+            raise UserError(
+                f"--ckpt_path is missing: `dds {self.stage.name} {self.config.subcommand}` needs a checkpoint"
+            )
+        elif settings.model.get("init_from") is not None and not self.parse_only:
+            self._take_shape(settings.model)
+
+    def resume(self, path: str | Path) -> None:
+        """Go on from a checkpoint: what shaped its training comes from it, and contradictions are refused.
+
+        Raises:
+            UserError: It cannot be read, is another stage's, or was trained with settings other than those given.
+        """
+        settings = self.settings
         if settings.model.get("init_from") is not None:
-            if any(word.startswith("--model.init_from") for word in self.words):
+            if any(argument.startswith("--model.init_from") for argument in self.arguments):
                 raise UserError(
                     f"--ckpt_path is {path} and --model.init_from is {settings.model.init_from}: the first continues "
                     "a training, the second starts a new one from weights; give one of them"
                 )
             settings.model.init_from = None  # a file of settings says how the training began that goes on here
-        self.checkpoint = load_checkpoint(path, self.stage)
-        linked = {f"model.{name}" for name in LINKS[self.stage]}
+        settings.ckpt_path = str(path)
+        self.checkpoint = load_checkpoint(str(path), self.stage.name)
+        linked = {f"model.{name}" for name in self.stage.links}
         trained = {f"model.{name}": value for name, value in self.checkpoint["hyper_parameters"].items()}
         if self.config.subcommand == "fit":  # one may look at a model with other data
-            trained |= self.checkpoint.get(KeptSettings.KEY, {})
+            trained |= self.checkpoint.get(TrainingSettings.KEY, {})
         chosen = self._chosen()
         for name, value in trained.items():
             if name in chosen and chosen[name] != value:
@@ -149,36 +147,40 @@ class StageCLI(LightningCLI):
                 settings[name] = value
 
     def _take_shape(self, model: Namespace) -> None:
-        """Take what shapes the network from the checkpoint to start from, save what the user wrote down."""
-        from dds_lightning.finetune import read
-        from dds_lightning.module import StageModule
-
-        cls: Any = modules(self.stage)[0]
-        assert issubclass(cls, StageModule)
+        """Take what shapes the network from the checkpoint to start from, except what the user gave."""
+        cls = self.stage.module_class()
         trained, chosen = read(cls, model.init_from).hparams, self._chosen()
         for name in cls.SHAPE:
-            if f"model.{name}" not in chosen and name not in LINKS[self.stage]:
+            if f"model.{name}" not in chosen and name not in self.stage.links:
                 model[name] = trained[name]
 
     def _chosen(self) -> Namespace:
-        """Settings that the user wrote down, on the command line or in a file; no defaults."""
-        given: Namespace = self.parser.parse_args(self.words, defaults=False)
+        """Settings that the user gave, on the command line or in a file; no defaults."""
+        given: Namespace = self.parser.parse_args(self.arguments, defaults=False)
         return given[self.config.subcommand]
 
     # ---------------------------------------------------------------- building
 
     def _set_seed(self) -> None:
-        if not self.parse_only:
-            super()._set_seed()
+        """Wait for `build`."""
 
     def instantiate_classes(self) -> None:
-        """Build data, model and trainer, unless only the settings were asked for."""
-        if self.parse_only:
-            return
+        """Wait for `build`."""
+
+    def _run_subcommand(self, subcommand: str) -> None:
+        """Wait for `execute`."""
+
+    def build(self) -> "StageCLI":
+        """Seed everything, then make data, model and trainer.
+
+        Raises:
+            UserError: They do not fit each other, or the checkpoint.
+        """
+        super()._set_seed()
         super().instantiate_classes()
         trained = (self.checkpoint or {}).get("hyper_parameters", {})
-        path = self._get(self.config, "ckpt_path")
-        for name in LINKS[self.stage]:
+        path = self.settings.get("ckpt_path")
+        for name in self.stage.links:
             if trained.get(name) in (None, self.model.hparams[name]):
                 continue
             if name == "skill_hash":
@@ -191,19 +193,16 @@ class StageCLI(LightningCLI):
                 f"checkpoint {path} was trained with {name} {trained[name]}, the data have "
                 f"{self.model.hparams[name]}: use a checkpoint and data of the same task"
             )
+        return self
 
     def _instantiate_trainer(self, config: dict[str, Any], callbacks: list[pl.Callback]) -> pl.Trainer:
-        callbacks = [*callbacks, KeptSettings(self._settings_to_keep())]
+        callbacks = [*callbacks, TrainingSettings(self._settings_to_keep())]
         return super()._instantiate_trainer(trainer_settings(dict(config), callbacks), [])
 
     def _settings_to_keep(self) -> dict[str, Any]:
         """Seed and settings of the data: with the model's own, what a training cannot change on its way."""
-        settings = self.config[self.config.subcommand]
-        data = {f"data.{name}": value for name, value in settings.data.as_dict().items() if name not in PLACES}
-        return {"seed_everything": settings.seed_everything, **data}
-
-    def _run_subcommand(self, subcommand: str) -> None:
-        """Wait for `execute`."""
+        data = {f"data.{name}": value for name, value in self.settings.data.as_dict().items() if name not in PLACES}
+        return {"seed_everything": self.settings.seed_everything, **data}
 
     # ---------------------------------------------------------------- working
 
@@ -213,55 +212,18 @@ class StageCLI(LightningCLI):
             # Lightning makes its log folder first and looks at the data afterwards.
             self.datamodule.prepare_data()
             self.datamodule.setup(str(self.subcommand))
-        if self.subcommand == "fit" and self.checkpoint is None:
-            self.model.refuse_frozen_without_weights()
+        if self.subcommand == "fit":
+            return self._fit()
         work: Callable[..., Report] = getattr(self, f"_{self.subcommand}")
-        try:
+        with advice_on_memory(self.trainer, self.model, self.datamodule):
             return work(**self._prepare_subcommand_kwargs(str(self.subcommand)))
-        except (MemoryError, RuntimeError) as error:
-            if not is_out_of_memory(error):
-                raise
-            raise UserError(self._memory_advice(error)) from error
 
-    def _memory_advice(self, error: Exception) -> str:
-        """What to make smaller, and what is left."""
-        batch = self._get(self.config, "data.batch_size")
-        skill = self.stage == "skill"
-        horizon = self.model.hparams["horizon"] if skill else self.datamodule.skill.horizon
-        wider = "data.horizon or model.hidden_dim" if skill else "model.hidden_dims"
-        told = f"out of memory at step {self.trainer.global_step} with data.batch_size {batch} and horizon {horizon}"
-        saved = self._rolling.path if self._rolling else None
-        left = f"; {saved} is whole, and --model.init_from={saved} starts from it" if saved and saved.is_file() else ""
-        return f"{told} ({reason(error)}): lower data.batch_size first, then {wider}{left}"
-
-    @property
-    def _rolling(self) -> RollingCheckpoint | None:
-        return next((c for c in self.trainer.checkpoint_callbacks if isinstance(c, RollingCheckpoint)), None)
-
-    def _fit(self, **kwargs: Any) -> Report:
-        kwargs["weights_only"] = True
-        try:
-            with interrupts.deferred():
-                self.trainer.fit(**kwargs)
-        except SIGTERMException:  # before the first step; Lightning would end with status 0
-            raise interrupts.Interrupted(signal.SIGTERM) from None
-        saved = {
-            "checkpoint": self._rolling.path if self._rolling else None,
-            "best": next(
-                (c.best_model_path for c in self.trainer.checkpoint_callbacks if isinstance(c, BestCheckpoint)),
-                None,
-            )
-            or None,
-        }
-        data = {
-            **saved,
-            "steps": self.trainer.global_step,
-            "metrics": self._rolling.latest(self.trainer) if self._rolling else _numbers(self.trainer.callback_metrics),
-            "logs": self.trainer.log_dir,
-        }
-        lines: list[Any] = [f"{self.trainer.global_step:,} steps; logs in {self.trainer.log_dir}"]
+    def _fit(self) -> Report:
+        made = fit(self.trainer, self.model, self.datamodule, self.settings.get("ckpt_path"))
+        saved = {"checkpoint": made.checkpoint, "best": made.best}
+        lines: list[Any] = [f"{made.steps:,} steps; logs in {made.logs}"]
         lines += [f"{name}: {path}" for name, path in saved.items() if path]
-        return Report(data, lines)
+        return Report({**saved, "steps": made.steps, "metrics": made.metrics, "logs": made.logs}, lines)
 
     def _validate(self, **kwargs: Any) -> Report:
         return self._look(self.trainer.validate, kwargs)
@@ -272,8 +234,8 @@ class StageCLI(LightningCLI):
     def _look(self, method: Callable[..., Any], kwargs: dict[str, Any]) -> Report:
         import pandas as pd
 
-        found = method(**{**kwargs, "verbose": False, "weights_only": True})
-        metrics = {name: value for loader in found for name, value in loader.items()}
+        logged = method(**{**kwargs, "verbose": False, "weights_only": True})
+        metrics = {name: value for loader in logged for name, value in loader.items()}
         rows = pd.DataFrame({"metric": list(metrics), "value": list(metrics.values())})
         return Report({"checkpoint": kwargs["ckpt_path"], "metrics": metrics}, [table(rows, digits=4)])
 
@@ -282,79 +244,64 @@ class StageCLI(LightningCLI):
 
         kwargs |= {"return_predictions": True, "weights_only": True}
         batches: list[Any] = self.trainer.predict(**kwargs) or []
-        codes = torch.cat([batch.reshape(-1) for batch in batches]).cpu().numpy()
+        values = torch.cat(batches).cpu().numpy()  # (N,) or (N, columns)
         folder = Path(self.trainer.log_dir or self.trainer.default_root_dir)
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / "predictions.parquet"
-        pd.DataFrame({"code": codes}).to_parquet(path)
-        counts = pd.Series(codes).value_counts().sort_index()
+        name = self.model.PREDICTION
+        columns = [name] if values.ndim == 1 else [f"{name} {j}" for j in range(values.shape[1])]
+        pd.DataFrame(values, columns=columns).to_parquet(path)
+        data: dict[str, Any] = {"file": path, "rows": len(values)}
+        if name != "code":
+            return Report(data, [str(path)])
+        counts = pd.Series(values).value_counts().sort_index()
         usage = pd.DataFrame({"code": counts.index, "count": counts.to_numpy()})
-        return Report({"file": path, "rows": len(codes), "codes": usage}, [table(usage), str(path)])
-
-
-def _numbers(metrics: dict[str, Any]) -> dict[str, float]:
-    return {name: float(value) for name, value in metrics.items()}
+        return Report({**data, "codes": usage}, [table(usage), str(path)])
 
 
 def load_checkpoint(path: str, stage: str) -> dict[str, Any]:
-    """Read a Lightning checkpoint without running code from it.
+    """Read a Lightning checkpoint of a stage without running code from it.
 
     Raises:
-        UserError: no such file, unreadable, or of another kind of model.
+        UserError: No such file, unreadable, or another stage's.
     """
     try:
         checkpoint = load_ckpt(path)
     except UserError as error:
         raise UserError(f"--ckpt_path: {error}") from None
-    trained = checkpoint.get("hyper_parameters") or {}
-    marks = {"skill": "horizon", "policy": "tau"}
-    if marks[stage] not in trained:
-        other = next((name for name, mark in marks.items() if mark in trained), "other")
-        raise UserError(f"--ckpt_path: {path} is a checkpoint of a {other} model, expected a {stage} model")
+    saved = stage_of(checkpoint)
+    if saved != stage:
+        raise UserError(f"--ckpt_path: {path} is a checkpoint of a {saved or 'other'} model, expected a {stage} model")
     return checkpoint
 
 
-def quieten() -> None:
-    """Silence what Lightning says at each start, and warnings about choices that were made on purpose."""
-    for name in ("lightning.pytorch", "lightning.fabric"):
-        logging.getLogger(name).setLevel(logging.WARNING)
-    for text in (
-        ".*does not have many workers.*",
-        ".*Checkpoint directory .* exists and is not empty.*",
-        ".*You're resuming from a checkpoint that ended before the epoch ended.*",
-        ".*`IterableDataset` has `__len__` defined.*",
-        ".*The number of training batches .* is smaller than the logging interval.*",
-        ".*isinstance.treespec, LeafSpec.*",
-        ".*module.s. in eval mode at the start of training.*",  # the frozen parts of a fine-tuning
-    ):
-        warnings.filterwarnings("ignore", message=text)
-
-
-def command(stage: str, words: Sequence[str]) -> Callable[[], Report]:
-    """Parse the words after `dds skill` or `dds policy`; the result does the work."""
+def command(stage: str, arguments: Sequence[str]) -> Callable[[], Report]:
+    """Parse the arguments after `dds STAGE` and build what they ask for; the result does the work."""
     quieten()
-    if not words:
-        words = ["--help"]
-    return StageCLI(stage, words).execute
+    return StageCLI(stage, arguments or ["--help"]).build().execute
 
 
-def settings_of(stage: str, words: Sequence[str]) -> dict[str, Any]:
+def settings_of(stage: str, arguments: Sequence[str]) -> dict[str, Any]:
     """All settings of a `fit`, defaults included, as plain values: what `--print_config` prints.
 
     Raises:
-        UserError: words that `dds STAGE fit` does not understand.
+        UserError: Arguments that `dds STAGE fit` does not understand.
     """
-    import yaml
+    return parsed(stage, arguments).dump()
 
+
+def parsed(stage: str, arguments: Sequence[str]) -> StageCLI:
+    """A stage's command line, parsed and not built.
+
+    Raises:
+        UserError: Arguments that `dds STAGE fit` does not understand.
+    """
     try:
-        cli = StageCLI(stage, words, parse_only=True)
+        return StageCLI(stage, arguments, parse_only=True)
     except ArgumentError as error:
         raise UserError(f"dds {stage} fit: {error.message}") from None
-    parser = cli._parser(cli.config.subcommand)
-    text = parser.dump(cli.config[cli.config.subcommand], skip_unset=False, skip_validation=True)
-    return yaml.safe_load(text)
 
 
-def command_line(stage: str, words: Sequence[str]) -> str:
-    """The command a person would type for these words."""
-    return shlex.join(["dds", stage, *words])
+def command_line(stage: str, arguments: Sequence[str]) -> str:
+    """The command a person would type for these arguments."""
+    return shlex.join(["dds", stage, *arguments])

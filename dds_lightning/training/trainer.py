@@ -20,11 +20,11 @@ from dds_lightning.saving.checkpoint import AtomicCheckpointIO
 from dds_lightning.training.progress import StepProgress
 
 
-class KeptSettings(Callback):
-    """Keep in every checkpoint how its training was asked for, so that a contradiction is noticed on resuming.
+class TrainingSettings(Callback):
+    """Keep in every checkpoint the settings its training was started with, so that resuming can refuse others.
 
     Args:
-        settings: dotted name -> plain value.
+        settings: Dotted name -> plain value.
     """
 
     KEY = "settings"
@@ -36,7 +36,7 @@ class KeptSettings(Callback):
     def on_save_checkpoint(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Add them."""
+        """Add the settings."""
         checkpoint[self.KEY] = self.settings
 
 
@@ -49,11 +49,11 @@ def loggers(root: str | Path) -> list[Logger]:
 
 
 def trainer_settings(config: dict[str, Any], extra: list[Callback]) -> dict[str, Any]:
-    """Complete a Trainer's settings with this project's parts, as long as the user did not choose others.
+    """Complete a Trainer's settings with this project's parts, unless the user chose others.
 
     Args:
-        config: keyword arguments of `Trainer`, as a user gave them.
-        extra: callbacks beside those in `config`; checkpoints among them are left out where checkpointing is
+        config: Keyword arguments of `Trainer`, as a user gave them.
+        extra: Callbacks in addition to those in `config`; checkpoints among them are left out where checkpointing is
             off.
 
     Returns:

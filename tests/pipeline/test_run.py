@@ -2,12 +2,14 @@
 
 import contextlib
 import dataclasses
+import inspect
 import json
 import os
 import signal
 import threading
 import time
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pandas as pd
@@ -15,9 +17,10 @@ import pytest
 import torch
 
 from dds_lightning import DDSAgent
-from dds_lightning.cli import main
+from dds_lightning.cli import commands, main
 from dds_lightning.errors import UserError
 from dds_lightning.pipeline.settings import RunSettings, Trainings
+from dds_lightning.pipeline.steps import STEPS
 from dds_lightning.rollout.actors import EveryRow
 from dds_lightning.study import report
 from dds_lightning.study.contestants import final_table, way_name
@@ -229,10 +232,10 @@ def test_a_run_without_a_best_says_so(finished, capsys):
     ],
 )
 def test_the_policy_is_evaluated_four_times_except_where_the_maze_is_easy(task, every, steps, found):
-    wanted = RunSettings(task, Path("out"), evaluate_every=every, policy=(f"--trainer.max_steps={steps}",))
+    wanted = RunSettings(task, Path("out"), evaluate_every=every, stages={"policy": (f"--trainer.max_steps={steps}",)})
     trainings = Trainings(wanted, get_task(task))
     assert trainings.evaluate_every == found
-    settings = trainings.settings["policy"]
+    settings = trainings.settings("policy")
     assert settings["best"]["monitor"] == ("rollout/score" if found else None)
     assert settings["best"]["every_n_steps"] == (found or None)
     callbacks = [callback["init_args"] for callback in settings["trainer"]["callbacks"] or []]
@@ -240,8 +243,59 @@ def test_the_policy_is_evaluated_four_times_except_where_the_maze_is_easy(task, 
         [(found, 10, 1)] if found else []
     )
     other = Trainings(dataclasses.replace(wanted, workers=3), get_task(task))
-    assert other.essence("policy") == trainings.essence("policy")
-    assert set(trainings.essence("skill")["best"]) == {"monitor", "mode"}  # runs of earlier versions are still done
+    assert other.cache_key_settings("policy") == trainings.cache_key_settings("policy")
+    assert set(trainings.cache_key_settings("skill")["best"]) == {
+        "monitor",
+        "mode",
+    }  # runs of earlier versions are still done
+
+
+def _watching(trainings):
+    (callback,) = trainings.settings("policy")["trainer"]["callbacks"]
+    return {name: callback["init_args"][name] for name in ("selections", "temperature", "noise_scale")}
+
+
+def test_the_best_checkpoint_is_chosen_by_episodes_played_as_the_run_plays():
+    """The kitchen acts greedily without noise: sampled codes with noise would keep another checkpoint."""
+    kitchen = RunSettings.with_preset("kitchen-mixed", Path("out"))
+    assert _watching(Trainings(kitchen, get_task("kitchen-mixed"))) == {
+        "selections": ["greedy"],
+        "temperature": 1.0,
+        "noise_scale": 0.0,
+    }
+    asked = dataclasses.replace(kitchen, selection="sample", temperature=0.5, noise_scale=None)
+    assert _watching(Trainings(asked, get_task("kitchen-mixed"))) == {
+        "selections": ["sample"],
+        "temperature": 0.5,
+        "noise_scale": None,
+    }
+
+
+def test_what_an_earlier_version_finished_is_still_done(finished, capsys, tmp_path):
+    """Version 0.1.0 kept three numbers of the clone, and evaluated the policy by sampled codes whatever the run did."""
+    out = tmp_path / "run"
+    given = [*SMALL, f"--data=local:{finished / 'data' / TASK}", "--out", out, "--evaluate_every=10"]
+    given += ["--selection=greedy", "--until=clone"]
+    call(capsys, *given)
+    clone, policy = (json.loads((out / name / "stage.json").read_text()) for name in ("clone", "policy"))
+    clone["settings"] = {"task": TASK, "seed": 0, "steps": 20}
+    (callback,) = policy["settings"]["trainer"]["callbacks"]
+    assert callback["init_args"]["selections"] == ["greedy"]
+    callback["init_args"]["selections"] = ["sample"]
+    for name, marker in (("clone", clone), ("policy", policy)):
+        (out / name / "stage.json").write_text(json.dumps(marker))
+    _, said, _ = call(capsys, *given)
+    assert said["done_before"] == STAGES[:5]
+    _, said, _ = call(capsys, *given, "--clone.model.lr=0.01")
+    assert said["done_before"] == STAGES[:4]
+
+
+def test_the_steps_come_after_what_they_read_and_are_those_that_until_takes():
+    assert list(STEPS) == STAGES
+    for index, step in enumerate(STEPS.values()):
+        assert set(step.reads) <= set(STAGES[:index])
+    until = inspect.signature(commands.run).parameters["until"].annotation
+    assert list(get_args(until)) == STAGES
 
 
 @pytest.mark.parametrize("every", [-1, 21])

@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 
 from dds_lightning.errors import UserError
-from dds_lightning.saving.run_directory import Stages, duration, locked, write_json
+from dds_lightning.saving.run_directory import RunDirectory, duration, locked, write_json
 
 
 class Script:
@@ -16,7 +16,7 @@ class Script:
         self.root, self.calls, self.fail = root, [], False
 
     def run(self, fresh=False, width=1, depth=1):
-        stages = Stages(self.root, Console(quiet=True), fresh)
+        stages = RunDirectory(self.root, Console(quiet=True), fresh)
 
         def first(folder, resuming):
             self.calls.append(("first", resuming))
@@ -67,7 +67,7 @@ def test_a_changed_setting_of_the_last_stage_leaves_the_first_alone(script):
 def test_the_reason_for_doing_a_stage_again_is_told(script):
     script.run()
     script_console = Console(record=True, quiet=False, file=open("/dev/null", "w"))  # noqa: SIM115
-    stages = Stages(script.root, script_console)
+    stages = RunDirectory(script.root, script_console)
     stages.do("first", "first", {"width": 5}, [], lambda folder, resuming: {})
     assert "width 1 -> 5" in script_console.export_text()
 

@@ -1,0 +1,283 @@
+"""The table of steps of `dds run`: what each reads, what its result depends on, and its work.
+
+```
+ data ─► skill ─► relabel ─► policy ─┬─► evaluate ─► report
+   └──────────► clone (baseline) ────┘
+```
+
+A new step is one more row of `STEPS`. A step may run as soon as those that it reads are done.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dds_lightning.study import contestants, protocol
+
+if TYPE_CHECKING:
+    from dds_lightning.agent import DDSAgent
+    from dds_lightning.pipeline.run import Run
+
+Settings = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of a run.
+
+    Attributes:
+        name: Of the step and of its folder.
+        reads: Steps whose outputs it uses.
+        title: What a person reads while it runs.
+        settings: Everything that its result depends on beside `reads`; JSON values.
+        work: Does it: (run, folder, whether an interrupted one goes on) to outputs (paths) and facts.
+        former: `settings` as an earlier version wrote them; None where they are the same.
+    """
+
+    name: str
+    reads: tuple[str, ...]
+    title: Callable[[Run], str]
+    settings: Callable[[Run], Settings]
+    work: Callable[[Run, Path, bool], Mapping[str, Any]]
+    former: Callable[[Run], Settings] | None = None
+
+
+# ---------------------------------------------------------------------- data
+
+
+def _data_title(run: Run) -> str:
+    wanted = run.wanted
+    if wanted.data is None:
+        return f"data: {wanted.data_steps:,} steps of {run.task.name}"
+    return f"data: {wanted.data}"
+
+
+def _data_settings(run: Run) -> Settings:
+    wanted = run.wanted
+    settings: Settings = {"task": run.task.name, "data": wanted.data}
+    if wanted.data is None:
+        return {**settings, "steps": wanted.data_steps, "seed": wanted.seed}
+    return {**settings, "files": run.data_hash}
+
+
+def _data(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
+    """Collect data, or look at what was given."""
+    from datamodules.inspection import describe
+    from datamodules.sources import load_trajectories
+    from dds_lightning.study.diagnosis import behaviour_scores
+
+    outputs: dict[str, Any] = {}
+    wanted, spec = run.wanted, run.wanted.data
+    if spec is None:
+        from datamodules.collect.collectors import collect
+
+        outputs["data"] = collect(
+            run.task,
+            wanted.data_steps,
+            wanted.seed,
+            folder,
+            wanted.workers,
+            dataset_id=run.task.name,
+            overwrite=True,
+        )
+        spec = f"local:{outputs['data']}"
+    trajectories = load_trajectories(spec, run.task)
+    facts, _ = describe(trajectories, task=run.task)
+    return {**outputs, "facts": facts, "scores": behaviour_scores(trajectories, run.task)}
+
+
+# ---------------------------------------------------------------------- trainings
+
+
+def training_step(stage: str, reads: tuple[str, ...], title: Callable[[Run, Settings], str], best: str = "") -> Step:
+    """The step that trains a stage.
+
+    Args:
+        stage: Name of a registered training stage.
+        reads: As of a `Step`.
+        title: From the run and the training's settings.
+        best: What a best checkpoint is, where one was kept: "replaces" the last one for the steps that follow, or is
+            told "beside" it.
+    """
+    return Step(
+        stage,
+        reads,
+        lambda run: title(run, run.trainings.settings(stage)),
+        lambda run: run.trainings.cache_key_settings(stage),
+        partial(_fit, stage, best),
+        lambda run: run.trainings.former_settings(stage),
+    )
+
+
+def _fit(stage: str, best: str, run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
+    """Run `dds STAGE fit`, from its last checkpoint if there is one."""
+    skill = run.output("skill", "checkpoint") if stage == "policy" else None
+    last = folder / "last.ckpt"
+    resume = last if resuming and last.is_file() else None
+    run.say(run.trainings.command(stage, run.data_spec, skill, resume), style="dim")
+    fitted = run.trainings.fit(stage, run.data_spec, skill, resume).data
+    made: dict[str, Any] = {name: Path(fitted[name]) for name in ("checkpoint", "best") if fitted[name]}
+    if "best" in made and best == "replaces":
+        made["checkpoint"] = made.pop("best")
+    elif "best" in made:
+        made["chosen"] = protocol.best_facts(made["checkpoint"], made["best"])
+    metrics = {name: round(value, 6) for name, value in fitted["metrics"].items()}
+    return {**made, "steps": fitted["steps"], "metrics": metrics}
+
+
+def _relabel(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
+    """Fill the cache that `dds policy fit` reads."""
+    from datamodules.relabel import Relabelled
+    from datamodules.relabelled import RelabeledDataModule
+
+    skill = str(run.output("skill", "checkpoint"))
+    options = run.trainings.relabelling()
+    module = RelabeledDataModule(run.task.name, run.data_spec, skill, cache=str(folder), **options)
+    module.prepare_data()
+    summary = Relabelled.load(module.cache_file()).summary()
+    summary.to_csv(folder / "codes.csv", index=False)
+    return {"relabelled": module.cache_file(), "codes": folder / "codes.csv"}
+
+
+# ---------------------------------------------------------------------- evaluation and report
+
+
+def _evaluation_settings(run: Run) -> Settings:
+    wanted = run.wanted
+    settings: Settings = {
+        "task": run.task.name,
+        "seed": wanted.seed,
+        "episodes": run.episodes,
+        "episodes_per_skill": wanted.episodes_per_skill,
+        "selection": wanted.selection,
+        "temperature": wanted.temperature,
+    }
+    return settings if wanted.noise_scale is None else {**settings, "noise_scale": wanted.noise_scale}
+
+
+def _evaluate(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
+    """Publish the agent and let everyone in the table play."""
+    from dds_lightning.agent import DDSAgent
+    from dds_lightning.baselines.behaviour_cloning import CloneActor
+    from dds_lightning.console.reports import plain
+    from dds_lightning.policy import PolicyModule
+    from dds_lightning.rollout.play import rollout
+    from dds_lightning.skill import SkillModule
+
+    wanted, task = run.wanted, run.task
+    chosen: dict[str, Any] = run.facts("policy").get("chosen", {})
+    skill = SkillModule.load(run.output("skill", "checkpoint"))
+
+    def agent_of(checkpoint: str) -> DDSAgent:
+        policy = PolicyModule.load(run.output("policy", checkpoint))
+        way: Any = wanted.selection
+        return DDSAgent(skill, policy, way, wanted.temperature, wanted.noise_scale, seed=wanted.seed)
+
+    agent = agent_of("checkpoint")
+    best = agent_of("best") if chosen else None
+    players = contestants.final_table(
+        agent,
+        task,
+        run.episodes,
+        wanted.episodes_per_skill,
+        clone=CloneActor.load(run.output("clone", "checkpoint")),
+        controller=contestants.behaviour_controller(task) if wanted.data is None else None,
+        best=contestants.best_ways(best, run.episodes, chosen) if best else (),
+    )
+    result = rollout(task, players, seed=wanted.seed, workers=wanted.workers, record=True)
+    result.save(folder)
+    results = json.loads(result.summary().round(4).to_json(orient="records"))  # NaN becomes null
+    metrics = {"episodes": run.episodes, "seed": wanted.seed, "results": results}
+    made: dict[str, Any] = {
+        "protocol": protocol.protocol(
+            task, agent, episodes=run.episodes, seed=wanted.seed, temperature=wanted.temperature, best=chosen
+        ),
+        "start_value": plain(protocol.start_value(task, agent, wanted.seed)),
+        "agent": agent.save(run.out / "agent", metrics=metrics, card=_card(run, result.episodes), task=task.name),
+    }
+    if best:
+        place = run.out / contestants.BEST_AGENT
+        made["best"] = best.save(place, metrics=metrics, task=task.name, checkpoint=chosen)
+    return {"episodes": folder / "episodes.parquet", **made, "results": results}
+
+
+def _card(run: Run, episodes: Any) -> str:
+    """The README.md of the published agent."""
+    from datamodules.collect.collectors import collection_command
+    from dds_lightning.study.card import agent_card
+
+    wanted = run.wanted
+    command = f"dds data collect {run.task.name} --steps {wanted.data_steps} --seed {wanted.seed}"
+    source = f"collected by `{command}`"
+    if wanted.data is not None:
+        known = collection_command(wanted.data.removeprefix("local:")) if wanted.data.startswith("local:") else None
+        source = f"collected by `{known}` ({wanted.data})" if known else wanted.data
+    return agent_card(
+        run.task,
+        episodes,
+        seed=wanted.seed,
+        data={"source": source, **run.facts("data")["facts"]},
+        settings={stage: run.trainings.settings(stage) for stage in ("skill", "policy")},
+        command=wanted.command(),
+    )
+
+
+def _write_report(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
+    """Draw what a person looks at."""
+    from dds_lightning.study.report import write_report
+
+    return dict(write_report(run.out))
+
+
+# ---------------------------------------------------------------------- the table
+
+
+def _skill_title(run: Run, settings: Settings) -> str:
+    return f"skill: {settings['model']['num_skills']} codes, {settings['trainer']['max_steps']:,} steps"
+
+
+STEPS: dict[str, Step] = {
+    step.name: step
+    for step in (
+        Step("data", (), _data_title, _data_settings, _data),
+        training_step("skill", ("data",), _skill_title, best="replaces"),
+        Step(
+            "relabel",
+            ("data", "skill"),
+            lambda run: "relabel: segments to skills",
+            lambda run: {"task": run.task.name, **run.trainings.relabelling()},
+            _relabel,
+        ),
+        training_step(
+            "policy",
+            ("data", "skill", "relabel"),
+            lambda run, settings: f"policy: {settings['trainer']['max_steps']:,} steps",
+            best="beside",
+        ),
+        training_step(
+            "clone",
+            ("data",),
+            lambda run, settings: f"clone: behaviour cloning, the baseline, {run.wanted.clone_steps:,} steps",
+        ),
+        Step(
+            "evaluate",
+            ("skill", "policy", "clone"),
+            lambda run: f"evaluate: {run.episodes} episodes each, in the real environment",
+            _evaluation_settings,
+            _evaluate,
+        ),
+        Step(
+            "report",
+            ("relabel", "skill", "policy", "evaluate"),
+            lambda run: "report: table, figures, clip",
+            lambda run: {"task": run.task.name},
+            _write_report,
+        ),
+    )
+}
+"""Name -> step, each after those that it reads."""

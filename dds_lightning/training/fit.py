@@ -1,0 +1,124 @@
+"""The one way in which every stage is trained: stoppable, resumable, with advice when memory runs out."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import signal
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import lightning.pytorch as pl
+import torch
+from lightning.pytorch.utilities.exceptions import SIGTERMException
+
+from dds_lightning.callbacks.best import BestCheckpoint
+from dds_lightning.callbacks.rolling import RollingCheckpoint
+from dds_lightning.console import interrupts
+from dds_lightning.errors import UserError, is_out_of_memory, reason
+from dds_lightning.module import StageModule
+from dds_lightning.training.stages import Stage, get_stage
+
+
+class Fitted(NamedTuple):
+    """What a training left.
+
+    Attributes:
+        checkpoint: The last checkpoint, from which it can go on; None where none is kept.
+        best: The checkpoint with the best value of the monitored metric, if one is kept.
+        steps: Optimiser steps in all, those of earlier launches included.
+        metrics: The last value of every metric.
+        logs: Folder of the logs.
+    """
+
+    checkpoint: Path | None
+    best: str | None
+    steps: int
+    metrics: dict[str, float]
+    logs: str | None
+
+
+def fit(
+    trainer: pl.Trainer,
+    module: StageModule,
+    data: pl.LightningDataModule,
+    checkpoint: str | Path | None = None,
+) -> Fitted:
+    """Train a stage.
+
+    Args:
+        trainer: With this project's parts, see `trainer_settings`.
+        module: Of one of the registered stages.
+        data: What it learns from.
+        checkpoint: `.ckpt` to go on from; None starts.
+
+    Raises:
+        UserError: Data or settings that cannot work, or memory that does not suffice.
+        Interrupted: SIGTERM or Ctrl-C asked to stop; everything was saved before.
+    """
+    stage = get_stage(module.STAGE)
+    if checkpoint is None:
+        module.refuse_frozen_without_weights()
+    try:
+        with advice_on_memory(trainer, module, data), torch_threads(stage.threads), interrupts.deferred():
+            trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
+    except SIGTERMException:  # before the first step; Lightning would end with status 0
+        raise interrupts.Interrupted(signal.SIGTERM) from None
+    saved = rolling(trainer)
+    best = next((c.best_model_path for c in trainer.checkpoint_callbacks if isinstance(c, BestCheckpoint)), None)
+    metrics = saved.latest(trainer) if saved else {name: float(x) for name, x in trainer.callback_metrics.items()}
+    return Fitted(saved.path if saved else None, best or None, trainer.global_step, metrics, trainer.log_dir)
+
+
+def rolling(trainer: pl.Trainer) -> RollingCheckpoint | None:
+    """The trainer's callback that keeps the last checkpoint, if it has one."""
+    return next((c for c in trainer.checkpoint_callbacks if isinstance(c, RollingCheckpoint)), None)
+
+
+@contextlib.contextmanager
+def advice_on_memory(trainer: pl.Trainer, module: StageModule, data: Any) -> Iterator[None]:
+    """Turn an error of memory into a sentence that says what to make smaller and what is left."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        stage: Stage = get_stage(module.STAGE)
+        sizes = f"data.batch_size {data.batch_size} and horizon {data.horizon}"
+        saved = rolling(trainer)
+        path = saved.path if saved else None
+        left = f"; {path} is whole, and --model.init_from={path} starts from it" if path and path.is_file() else ""
+        raise UserError(
+            f"out of memory at step {trainer.global_step} with {sizes} ({reason(error)}): lower data.batch_size "
+            f"first, then {stage.widths}{left}"
+        ) from error
+
+
+@contextlib.contextmanager
+def torch_threads(count: int | None) -> Iterator[None]:
+    """Let torch use `count` threads; None changes nothing."""
+    before = torch.get_num_threads()
+    if count is not None:
+        torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def quieten() -> None:
+    """Silence what Lightning says at each start, and warnings about choices that were made on purpose."""
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    for text in (
+        ".*does not have many workers.*",
+        ".*Checkpoint directory .* exists and is not empty.*",
+        ".*You're resuming from a checkpoint that ended before the epoch ended.*",
+        ".*`IterableDataset` has `__len__` defined.*",
+        ".*The number of training batches .* is smaller than the logging interval.*",
+        ".*isinstance.treespec, LeafSpec.*",
+        ".*module.s. in eval mode at the start of training.*",  # the frozen parts of a fine-tuning
+    ):
+        warnings.filterwarnings("ignore", message=text)

@@ -1,0 +1,137 @@
+"""The registry of training stages: a stage is a module, the data it learns from, and one row here.
+
+`dds STAGE fit`, `fit`, `dds run`, checkpoints, publishing and fine-tuning read this table. Importing it is cheap:
+modules and data are named, and imported when they are used.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dds_lightning.configs import find, preset_folder
+from dds_lightning.errors import UserError
+
+if TYPE_CHECKING:
+    import lightning.pytorch as pl
+
+    from dds_lightning.module import StageModule
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One training stage.
+
+    Attributes:
+        name: What a user types, stored in every checkpoint; the `STAGE` of its module.
+        description: First line of its help.
+        module: The `StageModule`, as "package.file:Class".
+        data: The `LightningDataModule`, likewise.
+        links: Attributes of the data that become settings of the module; never the user's to give.
+        steps: Optimiser steps without a configuration.
+        widths: The settings that take memory beside `data.batch_size`, for advice.
+        in_presets: Whether every preset folder must have a `NAME.yaml` for it.
+        preset: Packaged configuration where a preset folder has none; None takes the module's defaults.
+        threads: Threads of torch while fitting; None leaves torch's own number.
+    """
+
+    name: str
+    description: str
+    module: str
+    data: str
+    links: tuple[str, ...]
+    steps: int
+    widths: str
+    in_presets: bool = False
+    preset: str | None = None
+    threads: int | None = None
+
+    def module_class(self) -> type[StageModule]:
+        """Import the module."""
+        return _import(self.module)
+
+    def data_class(self) -> type[pl.LightningDataModule]:
+        """Import the data module."""
+        return _import(self.data)
+
+
+STAGES: dict[str, Stage] = {
+    stage.name: stage
+    for stage in (
+        Stage(
+            name="skill",
+            description="Stage one: learn discrete skills from segments of trajectories.",
+            module="dds_lightning.skill:SkillModule",
+            data="datamodules.segments:SegmentDataModule",
+            links=("observation_dim", "action_dim", "horizon"),
+            steps=500_000,  # the paper's, as are the defaults of the module
+            widths="data.horizon or model.hidden_dim",
+            in_presets=True,
+        ),
+        Stage(
+            name="policy",
+            description="Stage two: learn from relabelled data when to use which skill.",
+            module="dds_lightning.policy:PolicyModule",
+            data="datamodules.relabelled:RelabeledDataModule",
+            links=("observation_dim", "num_skills", "skill_hash"),
+            steps=1_500_000,
+            widths="model.hidden_dims",
+            in_presets=True,
+        ),
+        Stage(
+            name="clone",
+            description="The baseline without skills: clone the data's actions.",
+            module="dds_lightning.baselines.behaviour_cloning:BehaviourCloning",
+            data="datamodules.segments:SegmentDataModule",
+            links=("observation_dim", "action_dim"),
+            steps=4000,
+            widths="model.hidden_dims",
+            preset="clone.yaml",
+            threads=1,  # more gain little on an idle machine and cost much on a busy one
+        ),
+    )
+}
+"""Name -> stage, in the order of the method."""
+
+
+def preset_configs(name: str) -> dict[str, Path | None]:
+    """The configuration of every stage in a preset.
+
+    Args:
+        name: A packaged folder's name or a folder of the user's.
+
+    Returns:
+        Stage -> file; None where the module's defaults hold.
+
+    Raises:
+        UserError: There is no such preset, or it lacks the file of a stage that must be in it.
+    """
+    folder = preset_folder(name)
+    files: dict[str, Path | None] = {}
+    for stage in STAGES.values():
+        path = folder / f"{stage.name}.yaml"
+        if path.is_file():
+            files[stage.name] = path
+        elif stage.in_presets:
+            raise UserError(f"preset: folder {folder} has no {path.name}")
+        else:
+            files[stage.name] = find(stage.preset) if stage.preset else None
+    return files
+
+
+def get_stage(name: str) -> Stage:
+    """Look a stage up.
+
+    Raises:
+        UserError: There is no such stage.
+    """
+    if name not in STAGES:
+        raise UserError(f"stage is '{name}', expected one of {', '.join(STAGES)}")
+    return STAGES[name]
+
+
+def _import(address: str) -> Any:
+    module, _, name = address.partition(":")
+    return getattr(import_module(module), name)
