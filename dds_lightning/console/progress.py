@@ -7,32 +7,20 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any, TypeVar
 
+from rich import progress as bars
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    DownloadColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    SpinnerColumn,
-    TaskProgressColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-    TransferSpeedColumn,
-)
 
 T = TypeVar("T")
 
-COLUMNS: dict[str, Callable[[], ProgressColumn]] = {
-    "bar": BarColumn,
-    "bytes": DownloadColumn,
-    "count": MofNCompleteColumn,
-    "elapsed": TimeElapsedColumn,
-    "percent": TaskProgressColumn,
-    "remaining": TimeRemainingColumn,
-    "speed": TransferSpeedColumn,
-    "spinner": SpinnerColumn,
+COLUMNS: dict[str, Callable[[], bars.ProgressColumn]] = {
+    "bar": bars.BarColumn,
+    "bytes": bars.DownloadColumn,
+    "count": bars.MofNCompleteColumn,
+    "elapsed": bars.TimeElapsedColumn,
+    "percent": bars.TaskProgressColumn,
+    "remaining": bars.TimeRemainingColumn,
+    "speed": bars.TransferSpeedColumn,
+    "spinner": bars.SpinnerColumn,
 }
 """Names that a layout may use for rich's columns; anything else in a layout is text, such as "{task.description}"."""
 
@@ -72,9 +60,9 @@ def progress_bar(
     if not shown:  # not rich's `disable`: in rich 13.7 that writes an empty line
         yield lambda **changes: None
         return
-    columns = [COLUMNS[name]() if name in COLUMNS else TextColumn(name) for name in layout]
+    columns = [COLUMNS[name]() if name in COLUMNS else bars.TextColumn(name) for name in layout]
     console = console or Console(stderr=True)
-    with Progress(*columns, console=console, transient=transient) as progress:
+    with bars.Progress(*columns, console=console, transient=transient) as progress:
         yield partial(progress.update, progress.add_task(description, total=total, **fields))
 
 
