@@ -1,4 +1,8 @@
-"""One checkpoint from which a training continues exactly."""
+"""One checkpoint from which a training continues exactly where it stopped.
+
+Lightning's `ModelCheckpoint` does not serve here: it does not save when a signal asks to stop, and where it saves
+before a validation of the same step, resuming leaves that validation out.
+"""
 
 import time
 from pathlib import Path

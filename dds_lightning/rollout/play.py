@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from dds_lightning.console.progress import on_terminal, progress_bar
 from dds_lightning.envs.pool import EnvPool
 from dds_lightning.errors import UserError
 from dds_lightning.rollout.actors import Acted, Contestant
@@ -86,7 +87,7 @@ def rollout(
         if pool is None:
             pool = stack.enter_context(EnvPool(task, total, workers))
         count = sum(plan.contestant.episodes for plan in plans)
-        report = stack.enter_context(_progress_bar(count, progress, "success" if task.measures_success else "score"))
+        report = stack.enter_context(_mean_so_far(count, progress, "success" if task.measures_success else "score"))
         match = _Match(pool, plans, seed, record or record_observations, record_observations, report)
         stack.enter_context(_torch_threads(threads))
         rows = match.play(assign_slots(bundles, plans, seed))
@@ -224,7 +225,7 @@ class _Match:
 
 @contextlib.contextmanager
 def _torch_threads(count: int) -> Iterator[None]:
-    """Let torch use `count` threads."""
+    """Let torch use `count` threads inside the block."""
     import torch
 
     before = torch.get_num_threads()
@@ -236,31 +237,15 @@ def _torch_threads(count: int) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _progress_bar(total: int, wanted: bool, what: str) -> Iterator[Callable[[float], None]]:
-    """A bar of episodes done and the mean so far of "success" or "score", on standard error; silent elsewhere."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    if not (wanted and console.is_terminal):
-        yield lambda value: None
-        return
-    unit = " %" if what == "success" else ""
-    columns = (
-        TextColumn("episodes"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn(f"{what} {{task.fields[mean]:.0f}}{unit}"),
-        TimeRemainingColumn(),
-    )
-    values = 0.0
-    with Progress(*columns, console=console, transient=True) as bar:
-        line = bar.add_task("episodes", total=total, mean=0.0)
+def _mean_so_far(total: int, shown: bool, what: str) -> Iterator[Callable[[float], None]]:
+    """A bar of episodes done and the mean so far of "success" or "score"; shown on a terminal only."""
+    text = f"{what} {{task.fields[mean]:.0f}}{' %' if what == 'success' else ''}"
+    layout = ("episodes", "bar", "count", text, "remaining")
+    values: list[float] = []
+    with progress_bar(layout, total, shown=shown and on_terminal(), mean=0.0) as update:
 
         def report(value: float) -> None:
-            nonlocal values
-            values += value
-            done = bar.tasks[0].completed + 1
-            bar.update(line, advance=1, mean=values / done)
+            values.append(value)
+            update(advance=1, mean=sum(values) / len(values))
 
         yield report

@@ -1,4 +1,8 @@
-"""Files and folders written whole or not at all."""
+"""Files and folders written completely or not at all.
+
+The libraries for atomic files cover a single file only, without folders, stale leftovers of killed processes and a
+message that tells the user what a full or read-only disk means.
+"""
 
 from __future__ import annotations
 
