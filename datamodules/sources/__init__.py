@@ -1,39 +1,37 @@
-"""Where trajectories come from: `d4rl:FILE`, `minari:ID`, `local:DIR`, `arrays:DIR`; a new source is one more entry."""
+"""Where trajectories come from: `d4rl:FILE`, `minari:ID`, `local:DIR`, `arrays:DIR`.
+
+A new source is one `Source` record in a file of its own and one entry of `SOURCES`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Literal
 
-from datamodules.sources.arrays import load_arrays
-from datamodules.sources.d4rl import load_d4rl
+from datamodules.sources.arrays import ARRAYS
+from datamodules.sources.d4rl import D4RL
 from datamodules.sources.goal import cut_at_arrivals, relabel_to_goal
-from datamodules.sources.minari import load_local, load_minari_id, local_env_id, minari_env_id
+from datamodules.sources.minari import LOCAL, MINARI
+from datamodules.sources.source import Source
 from datamodules.sources.subtasks import relabel_subtasks
 from datamodules.trajectories import DataError, Trajectories
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import Task, get_task, task_for_env
 
+SOURCES: dict[str, Source] = {"local": LOCAL, "minari": MINARI, "arrays": ARRAYS, "d4rl": D4RL}
+"""What stands before the colon -> the source."""
 
-class Source(NamedTuple):
-    """One kind of source.
 
-    Attributes:
-        load: Reads what follows the colon, for a task that `resolve_task` has found.
-        recorded_in: Which environment the data say they were recorded in, without reading their arrays; None
-            where the format does not say.
+def parse_spec(spec: str) -> tuple[Source, str]:
+    """The source of `NAME:REST`, and the `REST`.
+
+    Raises:
+        UserError: For an unknown source, or nothing after the colon; the message lists the known ones.
     """
-
-    load: Callable[[str, Task | None], Trajectories]
-    recorded_in: Callable[[str], str | None]
-
-
-SOURCES: dict[str, Source] = {
-    "local": Source(load_local, local_env_id),
-    "minari": Source(load_minari_id, minari_env_id),
-    "arrays": Source(load_arrays, lambda directory: None),
-    "d4rl": Source(load_d4rl, lambda file: None),
-}
+    name, colon, rest = spec.partition(":")
+    if not colon or name not in SOURCES or not rest:
+        expected = ", ".join(f"{known}:{source.rest} ({source.about})" for known, source in SOURCES.items())
+        raise UserError(f"data: found '{spec}', expected one of {expected}")
+    return SOURCES[name], rest
 
 
 def resolve_task(spec: str, task: Task | str) -> Task:
@@ -47,7 +45,7 @@ def resolve_task(spec: str, task: Task | str) -> Task:
         DataError: For data of another task.
     """
     task = get_task(task) if isinstance(task, str) else task
-    source, rest = _parse(spec)
+    source, rest = parse_spec(spec)
     env_id = source.recorded_in(rest)
     if env_id is None:
         return task
@@ -59,14 +57,6 @@ def resolve_task(spec: str, task: Task | str) -> Task:
             f"{' or '.join(dict.fromkeys(fitting))}; choose the task that fits the data, or other data"
         )
     return found
-
-
-def _parse(spec: str) -> tuple[Source, str]:
-    source, colon, rest = spec.partition(":")
-    if not colon or source not in SOURCES or not rest:
-        expected = ", ".join(f"{name}:..." for name in SOURCES)
-        raise UserError(f"data: found '{spec}', expected one of {expected}")
-    return SOURCES[source], rest
 
 
 def load_trajectories(
@@ -93,7 +83,7 @@ def load_trajectories(
     """
     if reward not in ("task", "recorded"):
         raise UserError(f"reward: found '{reward}', expected 'task' or 'recorded'")
-    source, rest = _parse(spec)
+    source, rest = parse_spec(spec)
     task = resolve_task(spec, task) if task is not None else None
     trajectories = source.load(rest, task)
     if task is None or reward == "recorded" or task.data_reward == "environment":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 from pathlib import Path
 from urllib.parse import quote
@@ -76,11 +75,9 @@ def fetch_minari(dataset_id: str, root: str | Path | None = None) -> Path:
         UserError: See `datamodules.sources.download.download`.
         DataError: For metadata that `load_trajectories` would refuse.
     """
-    from datamodules.sources.minari import minari_root, read_metadata
+    from datamodules.sources.minari import check_minari_id, minari_root, read_metadata
 
-    if not re.fullmatch(r"[\w-]+(/[\w-]+)*", dataset_id):
-        raise UserError(f"data: '{dataset_id}' is no Minari id; one is pointmaze-large-diverse-v0")
-    folder = Path(root or minari_root()).expanduser() / dataset_id
+    folder = Path(root or minari_root()).expanduser() / check_minari_id(dataset_id)
     if folder.exists():
         return folder
     repository, _, inner = dataset_id.partition("/")

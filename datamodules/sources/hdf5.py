@@ -82,6 +82,30 @@ def member(group: h5py.Group, key: str, where: str) -> Any:
     return node
 
 
+def group_in(group: h5py.Group, key: str, where: str) -> h5py.Group:
+    """A member that must be a group.
+
+    Raises:
+        DataError: When it is an array, a link, stored elsewhere or damaged.
+    """
+    node = member(group, key, where)
+    if not isinstance(node, h5py.Group):
+        raise DataError(f"{where}, {key}: found an array, expected a group")
+    return node
+
+
+def array_in(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
+    """A member that must be an array of numbers, see `check_array`.
+
+    Raises:
+        DataError: When it is missing, a link, stored elsewhere, or refused by `check_array`.
+    """
+    found = list(group)
+    if key not in found:
+        raise DataError(f"{where}: '{key}' is missing; found {', '.join(found[:8]) or 'nothing'}")
+    return check_array(member(group, key, where), f"{where}, {key}")
+
+
 def check_array(node: Any, where: str) -> h5py.Dataset:
     """Refuse what is no plain array of numbers, or larger than its file can hold. Reads no data.
 

@@ -1,4 +1,4 @@
-"""Reads Minari data sets without trusting them: nothing in a data set is ever run.
+"""`local:DIR` and `minari:ID`: Minari data sets, read without trusting them; nothing in a data set is ever run.
 
 Minari's own loader builds environments from `metadata.json`, and with them whatever that file names. Here that
 file is judged first (`datamodules.sources.metadata`), and HDF5 is read directly, episode by episode, no more of
@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,10 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.sources.hdf5 import MAX_RATIO, SMALL, check_array, member, open_hdf5, read_rows
+from datamodules.sources.hdf5 import MAX_RATIO, SMALL, array_in, check_array, group_in, member, open_hdf5, read_rows
 from datamodules.sources.metadata import action_box, check_task, observation_layout, one_line, read_metadata
 from datamodules.sources.observations import Layout, Part
+from datamodules.sources.source import Recording, Source
 from datamodules.trajectories import Trajectories
 from datamodules.validation import FIELDS, DataError, validate_episode
 from dds_lightning.errors import UserError
@@ -29,32 +31,31 @@ from dds_lightning.tasks import Task
 Fields = dict[str, NDArray[Any]]
 
 
-def load_minari_id(dataset_id: str, task: Task | None) -> Trajectories:
-    """Read a data set of Minari's local store, by its id."""
-    return load_local(str(minari_folder(dataset_id)), task)
-
-
-def minari_env_id(dataset_id: str) -> str | None:
-    """The environment that a data set of Minari's local store was recorded in; None where it does not say."""
-    return local_env_id(str(minari_folder(dataset_id)))
-
-
-def local_env_id(directory: str) -> str | None:
-    """The same for a folder."""
+def local_env_id(directory: str | Path) -> str | None:
+    """The environment that the data set in a folder was recorded in; None where it does not say."""
     spec = read_metadata(data_folder(directory))["env_spec"]
     return None if spec is None else str(spec["id"])
+
+
+def check_minari_id(dataset_id: str) -> str:
+    """The id itself.
+
+    Raises:
+        UserError: For anything that is not an id, such as a path out of the store.
+    """
+    if not re.fullmatch(r"[\w-]+(/[\w-]+)*", dataset_id):
+        raise UserError(f"data: '{dataset_id}' is not a Minari id, expected one like pointmaze-large-diverse-v0")
+    return dataset_id
 
 
 def minari_folder(dataset_id: str) -> Path:
     """The folder of a data set in Minari's local store.
 
     Raises:
-        UserError: For what is no id, such as a path out of the store.
-        DataError: When it is not there.
+        UserError: For anything that is not an id.
+        DataError: When the data set does not exist.
     """
-    if not re.fullmatch(r"[\w-]+(/[\w-]+)*", dataset_id):
-        raise UserError(f"data: '{dataset_id}' is no Minari id; one is pointmaze-large-diverse-v0")
-    folder = minari_root() / dataset_id
+    folder = minari_root() / check_minari_id(dataset_id)
     if not folder.is_dir():
         raise DataError(
             f"data set '{dataset_id}' is not in {minari_root()}; collect it with `dds data collect`, "
@@ -68,7 +69,7 @@ def minari_root() -> Path:
     return Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets")
 
 
-def load_local(directory: str, task: Task | None) -> Trajectories:
+def load_local(directory: str | Path, task: Task | None) -> Trajectories:
     """Read the Minari data set in a folder (`DIR/data/main_data.hdf5` and `metadata.json`).
 
     Memory holds the result and one episode, whatever the file stores beside them.
@@ -232,3 +233,99 @@ class _Reader:
                 f"data set '{self.name}': the arrays of {self.path} are more than {MAX_RATIO} times as large as the "
                 "file, which is not believed"
             )
+
+
+# ---------------------------------------------------------------------- single rows
+
+EPISODES = 100
+"""Episodes from which single rows are read: each costs a few look-ups in the file."""
+
+
+@contextlib.contextmanager
+def open_local(directory: str | Path, task: Task, rng: np.random.Generator) -> Iterator[Recording]:
+    """Open the Minari data set in a folder for reading single rows; see `Source.open_rows`."""
+    data = data_folder(directory)
+    metadata = read_metadata(data)
+    check_task(metadata, task)
+    with open_hdf5(data / "main_data.hdf5", f"data set '{metadata['dataset_id']}'") as file:
+        yield _MinariRows(file, metadata, task, rng)
+
+
+class _MinariRows:
+    """Some episodes, spread over the set, of a Minari data set."""
+
+    def __init__(self, file: h5py.File, metadata: dict[str, Any], task: Task, rng: np.random.Generator) -> None:
+        self.where = f"data set '{metadata['dataset_id']}'"
+        self.layout = observation_layout(metadata, task)
+        labels = sorted(file, key=lambda label: (len(label), label))
+        if not labels:
+            raise DataError(f"{self.where} is empty: it has no episodes")
+        chosen = np.sort(rng.choice(len(labels), min(EPISODES, len(labels)), replace=False))
+        self.episodes = [self._episode(file, labels[number]) for number in chosen]
+        self.steps = self.known = np.array([len(episode["rewards"]) for episode in self.episodes])
+        self.ended = np.array(
+            [
+                bool(read_rows(episode["terminations"], self.where, count - 1, count)[0])
+                for episode, count in zip(self.episodes, self.steps.tolist(), strict=True)
+            ]
+        )
+        self.width = self.states(0, 0, 1).shape[1]
+
+    def _episode(self, file: h5py.File, label: str) -> dict[str, h5py.Dataset]:
+        where = f"{self.where}, {label}"
+        group = group_in(file, label, self.where)
+        fields = {key: array_in(group, key, where) for key in ("actions", "rewards", "terminations")}
+        steps = len(fields["rewards"])
+        if not self.layout.parts:
+            fields["observations"] = array_in(group, "observations", where)
+        else:
+            inner = group_in(group, "observations", where)
+            seen = f"{where}, observations"
+            fields |= {f"observations/{key}": array_in(inner, key, seen) for key in self.layout.parts}
+        for key, field in fields.items():
+            is_state = key.startswith("observations")
+            if len(field) != steps + is_state or field.ndim != (2 if is_state or key == "actions" else 1) or not steps:
+                expected = f"{steps + is_state} rows, for rewards has {steps}"
+                raise DataError(f"{where}, {key}: found shape {field.shape}, expected {expected}")
+        return fields
+
+    def states(self, episode: int, start: int, stop: int) -> NDArray[Any]:
+        fields = self.episodes[episode]
+        keys = [key for key in fields if key.startswith("observations")]
+        widths: list[int | None] = [part.columns for part in self.layout.parts.values()] or [None]
+        # The kitchen's velocities are kept here, which `Layout.flatten` leaves out.
+        parts = [
+            read_rows(fields[key], f"{self.where}, {key}", start, stop, width)
+            for key, width in zip(keys, widths, strict=True)
+        ]
+        return np.concatenate(parts, axis=1)
+
+    def taken(self, episode: int, start: int, stop: int) -> tuple[NDArray[Any], NDArray[Any]]:
+        fields = self.episodes[episode]
+        actions, rewards = (
+            read_rows(fields[key], f"{self.where}, {key}", start, stop) for key in ("actions", "rewards")
+        )
+        return actions, rewards
+
+    def inner(self, episode: int, step: int) -> None:
+        return None
+
+
+LOCAL = Source(
+    rest="DIR",
+    about="a folder with a Minari data set",
+    load=load_local,
+    locate=lambda directory: Path(directory).expanduser(),
+    open_rows=open_local,
+    recorded_in=local_env_id,
+)
+
+MINARI = Source(
+    rest="ID",
+    about="a data set in Minari's local store",
+    load=lambda dataset_id, task: load_local(minari_folder(dataset_id), task),
+    locate=lambda dataset_id: minari_root() / check_minari_id(dataset_id),
+    open_rows=lambda dataset_id, task, rng: open_local(minari_folder(dataset_id), task, rng),
+    recorded_in=lambda dataset_id: local_env_id(minari_folder(dataset_id)),
+)
+"""`local` under a folder that the id names."""

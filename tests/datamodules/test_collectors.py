@@ -1,14 +1,10 @@
-"""Which family has a collector, and how given data are told from changed ones."""
+"""Which family has a collector, what one shares with the others, and how a new one is added."""
 
 from __future__ import annotations
-
-import os
-from pathlib import Path
 
 import pytest
 
 from datamodules.collect.collectors import COLLECTORS, collect, collection_command, refuse_uncollectable
-from datamodules.sources.stat_hash import locate, signature
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import get_task, task_names
 
@@ -67,33 +63,6 @@ def test_a_recipe_that_is_none_is_refused(task, recipe, message, tmp_path):
     with pytest.raises(UserError, match=message):
         collect(task, 100, out=tmp_path, recipe=recipe)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_signature_changes_with_names_sizes_and_times(tmp_path, monkeypatch):
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    monkeypatch.setenv("D4RL_DATASET_DIR", str(tmp_path / "d4rl"))
-    file = tmp_path / "set" / "data.hdf5"
-    file.parent.mkdir()
-    file.write_bytes(b"abc")
-    (tmp_path / "d4rl").mkdir()
-    (tmp_path / "d4rl" / "one.hdf5").write_bytes(b"abc")
-    specs = [f"local:{tmp_path}/set", "minari:set", f"d4rl:{file}", "d4rl:one.hdf5", f"arrays:{tmp_path}/set"]
-    before = {spec: signature(spec) for spec in specs}
-    assert before == {spec: signature(spec) for spec in specs}
-    assert before["local:" + str(tmp_path / "set")] == before["minari:set"]
-    os.utime(file, ns=(1, 1))
-    changed = [spec for spec in specs if signature(spec) != before[spec]]
-    assert changed == [spec for spec in specs if spec != "d4rl:one.hdf5"]
-    assert locate("d4rl:one.hdf5") == tmp_path / "d4rl" / "one.hdf5"
-
-
-@pytest.mark.parametrize(
-    "spec", ["local:nowhere", "minari:nowhere", "d4rl:no/where.hdf5", "ftp:there", "local:", "d4rl:"]
-)
-def test_what_is_not_there_is_said_in_one_sentence(spec):
-    with pytest.raises(UserError, match=r"nothing at|missing"):
-        signature(spec)
-    assert list(Path().iterdir()) == []
 
 
 def test_a_collected_set_tells_the_command_that_makes_it_again(tmp_path):

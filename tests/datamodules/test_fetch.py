@@ -344,5 +344,5 @@ def test_minaris_metadata_are_checked_before_the_rest_is_fetched(
 
 
 def test_an_id_that_leaves_the_folder_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"'\.\./\.\./evil' is no Minari id"):
+    with pytest.raises(UserError, match=r"'\.\./\.\./evil' is not a Minari id"):
         fetch_minari("../../evil", tmp_path)

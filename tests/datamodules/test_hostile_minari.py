@@ -204,5 +204,5 @@ def test_a_name_that_is_a_path_names_nothing(name: Any, maze_set: Path) -> None:
 @pytest.mark.parametrize("name", ["../sets/set-v0", "..", "/etc", "a/../set-v0", "set-v0/", "set v0", "set-v0\n"])
 def test_an_id_that_is_a_path_is_refused(name: str, maze_set: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(maze_set.parent))
-    with pytest.raises(UserError, match="is no Minari id"):
+    with pytest.raises(UserError, match="is not a Minari id"):
         load_trajectories(f"minari:{name}", MAZE)
