@@ -44,7 +44,7 @@ def resolve_task(spec: str, task: Task | str) -> Task:
         UserError: For an unknown source or task.
         DataError: For data of another task.
     """
-    task = get_task(task) if isinstance(task, str) else task
+    task = get_task(task)
     source, rest = parse_spec(spec)
     env_id = source.recorded_in(rest)
     if env_id is None:

@@ -76,7 +76,7 @@ def rollout(
         UserError: contestants that cannot be played; the message names them.
         EnvPoolError: an environment failed.
     """
-    task = get_task(task) if isinstance(task, str) else task
+    task = get_task(task)
     check_contestants(contestants)
     if slots < 1:
         raise UserError(f"slots is {slots}, expected at least 1")

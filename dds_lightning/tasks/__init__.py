@@ -26,12 +26,14 @@ def task_names() -> tuple[str, ...]:
     return tuple(_TABLE)
 
 
-def get_task(name: str) -> Task:
-    """Look a task up by name, `NAME` or `NAME@VARIANT`.
+def get_task(name: str | Task) -> Task:
+    """Look a task up by name, `NAME` or `NAME@VARIANT`; a task stands for itself.
 
     Raises:
         UserError: When there is no such task; the message lists the nearest names.
     """
+    if isinstance(name, Task):
+        return name
     base, at, physics = str(name).partition("@")
     if base not in _TABLE:
         near = difflib.get_close_matches(base, _TABLE, n=3, cutoff=0.5) or list(_TABLE)

@@ -287,7 +287,7 @@ def test_an_interrupted_collection_goes_on_where_it_stopped(tmp_path: Path, monk
 @pytest.mark.parametrize(
     ("task", "options", "message"),
     [
-        ("hopper-medium", {}, "no kitchen task"),
+        ("hopper-medium", {}, "expected a task of kitchen"),
         ("kitchen-mixed", {"steps": 0}, "steps: found 0"),
         ("kitchen-mixed", {"seed": -1}, "seed: found -1"),
     ],

@@ -102,7 +102,7 @@ def test_the_shipped_ladder_gives_medium_and_expert_scores(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"task": "kitchen-mixed"}, "is no locomotion task"),
+        ({"task": "kitchen-mixed"}, "expected a task of locomotion"),
         ({"steps": 0}, "steps: found 0"),
         ({"workers": 0}, "workers: found 0"),
     ],
@@ -121,7 +121,9 @@ def test_recipes_out_of_range_are_refused(setting: dict[str, Any]) -> None:
 
 def test_the_behaviours_play_again_each_in_its_own_environments() -> None:
     quiet, noisy = LocomotionRecipe(action_noise=0.0), LocomotionRecipe(action_noise=0.1)
-    actions = Runners("hopper-medium-expert", quiet, ladder()).act(np.zeros((4, 11), np.float32))
+    four = Runners("hopper-medium-expert", quiet, ladder())
+    four.reset(4)
+    actions = four.act(np.zeros((4, 11), np.float32))
     assert np.allclose(actions, np.array([0.4, 0.8, 0.4, 0.8])[:, None])
     runners, again = (Runners("hopper-medium", noisy, ladder()) for _ in range(2))
     runners.reset(2, seed=3)
