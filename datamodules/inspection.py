@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from datamodules.sources import load_trajectories
 from datamodules.sources.subtasks import subtasks_completed
 from datamodules.trajectories import Trajectories
-from dds_lightning.tasks import Task, get_task
+from dds_lightning.tasks import Task
 from dds_lightning.tasks.columns import action_names, observation_names
 
 BLOCK = 65_536
@@ -33,8 +33,8 @@ def check_dataset(spec: str, task: Task | str | None = None, *, horizon: int | N
     Raises:
         DataError: At the first thing wrong; the message names data set, episode, field and value.
     """
-    task = get_task(task) if isinstance(task, str) else task
-    return describe(load_trajectories(spec, task), task=task, horizon=horizon)[0]
+    trajectories = load_trajectories(spec, task)
+    return describe(trajectories, task=trajectories.task, horizon=horizon)[0]
 
 
 def describe(

@@ -16,7 +16,7 @@ from datamodules.loader import TensorLoader
 from datamodules.partial_codes import PartialCodes
 from datamodules.relabel import Relabelled, relabel, relabel_key
 from datamodules.relabelling import Relabelling
-from datamodules.sources import load_trajectories, resolve_task
+from datamodules.sources import load_trajectories
 from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError
 from dds_lightning.skill import SkillModule
@@ -97,9 +97,9 @@ class RelabeledDataModule(pl.LightningDataModule):
             raise UserError(
                 "data.data is missing: give local:DIR, minari:ID or d4rl:FILE, or collect with `dds data collect TASK`"
             )
-        if self.task is not None:
-            self.task = resolve_task(self.hparams.data, self.task)
-        return load_trajectories(self.hparams.data, self.task)
+        trajectories = load_trajectories(self.hparams.data, self.task)
+        self.task = trajectories.task
+        return trajectories
 
     @property
     def batch_size(self) -> int:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from datamodules.collect.collectors import can_collect
 from datamodules.loader import Batch, TensorLoader
-from datamodules.sources import load_trajectories, resolve_task
+from datamodules.sources import load_trajectories
 from datamodules.trajectories import Trajectories, Windows
 from dds_lightning.errors import UserError
 from dds_lightning.nn.normaliser import MIN_STD
@@ -174,9 +174,8 @@ class SegmentDataModule(pl.LightningDataModule):
         if not hasattr(self, "trajectories"):
             if self.data is None:
                 raise UserError(self._how_to_get_data())
-            if self.task is not None:
-                self.task = resolve_task(self.data, self.task)
             self.trajectories = load_trajectories(self.data, self.task)
+            self.task = self.trajectories.task
         return self.trajectories
 
     def _how_to_get_data(self) -> str:

@@ -41,7 +41,7 @@ def save_arrays(
 
 def read_arrays(
     directory: str | Path, types: Mapping[str, Any], *, mmap: bool = False
-) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read what `save_arrays` wrote.
 
     Args:

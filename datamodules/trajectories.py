@@ -37,6 +37,7 @@ from numpy.typing import ArrayLike, NDArray
 from datamodules.storage import read_arrays, save_arrays
 from datamodules.validation import DataError, validate_episode
 from datamodules.windows import Windows, ranges, sliding_windows
+from dds_lightning.tasks import Task
 
 __all__ = ["DataError", "Trajectories", "Windows"]
 
@@ -69,6 +70,8 @@ class Trajectories:
         lengths: (E,) int64, steps of each episode.
         action_low: (A,) float32.
         action_high: (A,) float32.
+        task: The task, in its variant, that the data were loaded for; None if unknown. It is neither stored nor part
+            of the fingerprint.
     """
 
     name: str
@@ -80,6 +83,7 @@ class Trajectories:
     lengths: NDArray[np.int64]
     action_low: NDArray[np.float32]
     action_high: NDArray[np.float32]
+    task: Task | None = None
 
     # ------------------------------------------------------------------ making one
 
@@ -122,7 +126,7 @@ class Trajectories:
             validate_episode(name, label, fields, observation_dim=observation_dim, action_low=low, action_high=high)
             for label, fields in zip(names, episodes, strict=True)
         ]
-        joined = {key: np.concatenate([fields[key] for fields in checked]) for key in checked[0]}
+        joined: dict[str, Any] = {key: np.concatenate([fields[key] for fields in checked]) for key in checked[0]}
         lengths = np.array([len(fields["rewards"]) for fields in checked], np.int64)
         return cls(name=name, lengths=lengths, action_low=low, action_high=high, **joined)
 
@@ -147,6 +151,12 @@ class Trajectories:
             truncations=self.truncations[steps],
             lengths=self.lengths[ids],
         )
+
+    def for_task(self, task: Task | None) -> Trajectories:
+        """The same data for a task, without copying an array or computing the fingerprint again."""
+        same = replace(self, task=task)
+        vars(same).update({name: value for name, value in vars(self).items() if name not in vars(same)})
+        return same
 
     # ------------------------------------------------------------------ what is in it
 

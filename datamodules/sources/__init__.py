@@ -86,7 +86,7 @@ def load_trajectories(
     source, rest = parse_spec(spec)
     task = resolve_task(spec, task) if task is not None else None
     trajectories = source.load(rest, task)
-    if task is None or reward == "recorded" or task.data_reward == "environment":
-        return trajectories
-    relabel = {"goal": relabel_to_goal, "arrival": cut_at_arrivals, "subtasks": relabel_subtasks}[task.data_reward]
-    return relabel(trajectories, task)
+    if task is not None and reward == "task" and task.data_reward != "environment":
+        relabel = {"goal": relabel_to_goal, "arrival": cut_at_arrivals, "subtasks": relabel_subtasks}[task.data_reward]
+        trajectories = relabel(trajectories, task)
+    return trajectories.for_task(task)

@@ -28,7 +28,7 @@ from dds_lightning.errors import UserError
 from dds_lightning.saving.files import mend_folder
 from dds_lightning.tasks import Task
 
-Fields = dict[str, NDArray[Any]]
+Fields = dict[str, Any]
 
 
 def local_env_id(directory: str | Path) -> str | None:

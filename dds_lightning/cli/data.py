@@ -58,15 +58,15 @@ def show(
         no_figure: print the tables only
     """
     from datamodules.inspection import describe, episode_table
-    from datamodules.sources import load_trajectories, resolve_task
+    from datamodules.sources import load_trajectories
 
     spec = data_spec(data)
     if episodes < 0:
         raise UserError(f"--episodes is {episodes}, expected at least 0")
     if out is not None and Path(out).suffix not in FIGURES:
         raise UserError(f"--out is {out}, expected a name that ends in {', '.join(FIGURES)}")
-    chosen = resolve_task(spec, task) if task else None
-    trajectories = load_trajectories(spec, chosen)
+    trajectories = load_trajectories(spec, task or None)
+    chosen = trajectories.task
     facts, dimensions = describe(trajectories, task=chosen)
     rows = episode_table(trajectories).sort_values("steps", ascending=False, kind="stable").head(episodes)
     report = Report(

@@ -20,7 +20,7 @@ from dds_lightning.saving.run_directory import read_marker
 from dds_lightning.skill import SkillModule
 from dds_lightning.study.contestants import agent_directory, way
 from dds_lightning.study.findings import Findings
-from dds_lightning.tasks import Task, get_task
+from dds_lightning.tasks import Task
 
 SINGLE = "single skill"
 
@@ -105,7 +105,7 @@ def atlas(
         DataError: data that are damaged or another task's.
     """
     from datamodules.relabel import check_widths
-    from datamodules.sources import load_trajectories, resolve_task
+    from datamodules.sources import load_trajectories
 
     tell("looking at the checkpoint")
     subject = find_subject(place, seed)
@@ -114,10 +114,11 @@ def atlas(
         raise UserError(f"{place} does not know its data: give --data, for example local:DIR, minari:ID or d4rl:FILE")
     if name is None:
         raise UserError(f"{place} does not say which task it is for: give --task; `dds tasks` lists them")
-    wanted = resolve_task(spec, get_task(name))
     models = [SkillModule.load(path) for path in against]
     tell("reading the data")
-    trajectories = load_trajectories(spec, wanted)
+    trajectories = load_trajectories(spec, name)
+    wanted = trajectories.task
+    assert wanted is not None
     for model in (subject.agent.skill, *models):
         check_widths(trajectories, model)
     result, main, singles = _episodes(subject, wanted, episodes, seed, tell)

@@ -222,6 +222,9 @@ def test_other_versions_of_an_environment_choose_their_physics(
         assert node.shape[1:] == stored
     _same(load_trajectories(f"local:{folder}", name), episodes)
     assert resolve_task(f"local:{folder}", name).physics == variant
+    loaded = load_trajectories(f"local:{folder}", name)
+    assert loaded.task is not None
+    assert loaded.task.physics == variant
 
 
 @pytest.mark.parametrize("name", ["antmaze-umaze@robotics", "kitchen-mixed", "hopper-medium"])

@@ -9,6 +9,7 @@ import pytest
 
 from datamodules.trajectories import DataError, Trajectories
 from dds_lightning.errors import UserError
+from dds_lightning.tasks import get_task
 
 Make = Callable[..., dict[str, Any]]
 
@@ -143,3 +144,16 @@ def test_damaged_arrays_are_refused(three: Trajectories, tmp_path: Path) -> None
         Trajectories.load(folder)
     with pytest.raises(DataError, match=r"trajectories.json is missing or damaged"):
         Trajectories.load(tmp_path)
+
+
+def test_data_know_the_task_that_they_were_loaded_for(three: Trajectories, tmp_path: Path) -> None:
+    task = get_task("pointmaze-umaze-play")
+    assert three.task is None
+    mark = three.fingerprint()
+    known = three.for_task(task)
+    assert known.task == task
+    assert known.observations is three.observations
+    assert "_fingerprint" in vars(known), "hashing again would read everything again"
+    assert known.fingerprint() == mark
+    assert known.select([2, 0]).task == task
+    assert Trajectories.load(known.save(tmp_path / "set")).task is None
