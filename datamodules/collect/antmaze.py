@@ -37,7 +37,7 @@ class AntMazeRecipe:
 
     Attributes:
         action_noise: Standard deviation of the Gaussian noise on every action entry.
-        waypoint_noise: Waypoints lie up to this many metres beyond a cell's centre, on both axes, to one side.
+        waypoint_noise: Waypoints lie up to this many metres beyond a cell's centre on both axes, always to one side.
         episode_steps: Steps after which an episode is truncated.
         end_when_flipped: End an episode (truncation) when the ant has lain on its back for `FLIPPED_STEPS`;
             D4RL's episodes run on.
@@ -51,11 +51,11 @@ class AntMazeRecipe:
     def __post_init__(self) -> None:
         """Refuse settings out of range."""
         if not 0.0 <= self.action_noise < math.inf:
-            raise UserError(f"action_noise: found {self.action_noise}, expected a number of at least 0")
+            raise UserError(f"action_noise: got {self.action_noise}, expected a number of at least 0")
         if not 0.0 <= self.waypoint_noise <= 1.5:
-            raise UserError(f"waypoint_noise: found {self.waypoint_noise}, expected 0 to 1.5 metres")
+            raise UserError(f"waypoint_noise: got {self.waypoint_noise}, expected 0 to 1.5 metres")
         if self.episode_steps < 1:
-            raise UserError(f"episode_steps: found {self.episode_steps}, expected at least 1")
+            raise UserError(f"episode_steps: got {self.episode_steps}, expected at least 1")
 
 
 def _plan(task: Task, seed: int, steps: int, recipe: AntMazeRecipe) -> DataSetPlan:

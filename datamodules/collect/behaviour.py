@@ -46,22 +46,22 @@ class PointMazeRecipe:
     def __post_init__(self) -> None:
         """Refuse settings out of range."""
         if self.episode_steps < 1:
-            raise UserError(f"episode_steps: found {self.episode_steps}, expected at least 1")
+            raise UserError(f"episode_steps: got {self.episode_steps}, expected at least 1")
         if not 0 < self.speed <= 5:
-            raise UserError(f"speed: found {self.speed}, expected more than 0 and at most 5 metres a second")
+            raise UserError(f"speed: got {self.speed}, expected more than 0 and at most 5 metres a second")
         for name in ("waypoint_offset", "start_offset"):
             value = getattr(self, name)
             if not 0.0 <= value <= 0.4:
-                raise UserError(f"{name}: found {value}, expected 0 to 0.4 cells, beyond which there may be a wall")
+                raise UserError(f"{name}: got {value}, expected 0 to 0.4 cells, beyond which there may be a wall")
         if not 0.0 <= self.action_noise < math.inf:
-            raise UserError(f"action_noise: found {self.action_noise}, expected a number of at least 0")
+            raise UserError(f"action_noise: got {self.action_noise}, expected a number of at least 0")
         if not 0.0 <= self.burst_probability <= 1.0:
-            raise UserError(f"burst_probability: found {self.burst_probability}, expected 0 to 1")
+            raise UserError(f"burst_probability: got {self.burst_probability}, expected 0 to 1")
         if not 0.0 <= self.rest_share <= 1.0:
-            raise UserError(f"rest_share: found {self.rest_share}, expected 0 to 1")
+            raise UserError(f"rest_share: got {self.rest_share}, expected 0 to 1")
         low, high = self.burst_steps
         if not 1 <= low <= high:
-            raise UserError(f"burst_steps: found {self.burst_steps}, expected 1 <= shortest <= longest")
+            raise UserError(f"burst_steps: got {self.burst_steps}, expected 1 <= shortest <= longest")
 
 
 BehaviourNoise = PointMazeRecipe

@@ -147,9 +147,9 @@ def prepare_folder(task: Task, steps: int, seed: int, out: str | Path, dataset_i
         UserError: When a number is out of range, or the folder exists and may not be replaced.
     """
     if steps < 1:
-        raise UserError(f"steps: found {steps}, expected at least 1")
+        raise UserError(f"steps: got {steps}, expected at least 1")
     if seed < 0:
-        raise UserError(f"seed: found {seed}, expected at least 0")
+        raise UserError(f"seed: got {seed}, expected at least 0")
     folder = Path(out) / (dataset_id or task.data_ids["local"])
     refuse_existing(folder, overwrite)
     return folder

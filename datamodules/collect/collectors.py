@@ -89,7 +89,7 @@ def collect(
         if name not in known:
             raise UserError(f"recipe.{name}: '{task.name}' has no such setting; it has {', '.join(known)}")
         if not isinstance(value, bool | int | float):
-            raise UserError(f"recipe.{name}: found {value!r}, expected a number, true or false")
+            raise UserError(f"recipe.{name}: got {value!r}, expected a number, true or false")
     return collector.collect(task, steps, seed, out, workers, dataset_id=dataset_id, overwrite=overwrite, **settings)
 
 

@@ -71,14 +71,14 @@ class KitchenRecipe:
     def __post_init__(self) -> None:
         """Refuse settings out of range."""
         if not 0.0 <= self.action_noise < math.inf:
-            raise UserError(f"action_noise: found {self.action_noise}, expected a number of at least 0")
+            raise UserError(f"action_noise: got {self.action_noise}, expected a number of at least 0")
         if not 0.0 <= self.waypoint_noise <= 0.1:
-            raise UserError(f"waypoint_noise: found {self.waypoint_noise}, expected 0 to 0.1 metres")
+            raise UserError(f"waypoint_noise: got {self.waypoint_noise}, expected 0 to 0.1 metres")
         for name in ("speed_noise", "aimed_share"):
             if not 0.0 <= getattr(self, name) <= 1.0:
-                raise UserError(f"{name}: found {getattr(self, name)}, expected 0 to 1")
+                raise UserError(f"{name}: got {getattr(self, name)}, expected 0 to 1")
         if self.tries < 1:
-            raise UserError(f"tries: found {self.tries}, expected at least 1")
+            raise UserError(f"tries: got {self.tries}, expected at least 1")
 
 
 QUIET = KitchenRecipe(action_noise=0.0, waypoint_noise=0.0, speed_noise=0.0)

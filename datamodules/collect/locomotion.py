@@ -51,9 +51,9 @@ class LocomotionRecipe:
     def __post_init__(self) -> None:
         """Refuse settings out of range."""
         if not 0.0 <= self.action_noise < math.inf:
-            raise UserError(f"action_noise: found {self.action_noise}, expected a number of at least 0")
+            raise UserError(f"action_noise: got {self.action_noise}, expected a number of at least 0")
         if self.episode_steps < 1:
-            raise UserError(f"episode_steps: found {self.episode_steps}, expected at least 1")
+            raise UserError(f"episode_steps: got {self.episode_steps}, expected at least 1")
 
 
 def _plan(
@@ -92,7 +92,7 @@ def mixture(ladder: Mapping[str, MLPPolicy], quality: str) -> dict[str, MLPPolic
         "medium-expert": [names[middle], names[-1]],
     }
     if quality not in chosen:
-        raise UserError(f"quality: found '{quality}', expected one of {', '.join(chosen)}")
+        raise UserError(f"quality: got '{quality}', expected one of {', '.join(chosen)}")
     return {name: ladder[name] for name in chosen[quality]}
 
 

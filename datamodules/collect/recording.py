@@ -65,7 +65,7 @@ def record(
         UserError: For a number of workers below 1, or when a worker process died.
     """
     if workers is not None and workers < 1:
-        raise UserError(f"workers: found {workers}, expected at least 1, or none for every core")
+        raise UserError(f"workers: got {workers}, expected at least 1, or none for every core")
     if partial is not None:
         partial.open()
     chunks = range(0, recorder.rounds, chunk)

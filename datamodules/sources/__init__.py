@@ -30,15 +30,15 @@ def parse_spec(spec: str) -> tuple[Source, str]:
     name, colon, rest = spec.partition(":")
     if not colon or name not in SOURCES or not rest:
         expected = ", ".join(f"{known}:{source.rest} ({source.about})" for known, source in SOURCES.items())
-        raise UserError(f"data: found '{spec}', expected one of {expected}")
+        raise UserError(f"data: got '{spec}', expected one of {expected}")
     return SOURCES[name], rest
 
 
 def resolve_task(spec: str, task: Task | str) -> Task:
     """The variant of a task in which the data were recorded.
 
-    Scores are honest only in the physics that the data come from: a task whose name leaves the variant open
-    takes that of the data, as far as the data say it. A name with its variant (`hopper-medium@v4`) stands.
+    Scores are valid only in the physics that the data come from: a task whose name leaves the variant open takes that
+    of the data, if the data say it. A name with a variant (`hopper-medium@v4`) is kept.
 
     Raises:
         UserError: For an unknown source or task.
@@ -54,7 +54,7 @@ def resolve_task(spec: str, task: Task | str) -> Task:
         fitting = [one.env_id for one in (task, *map(task.variant, () if task.is_pinned else task.variants))]
         raise DataError(
             f"data '{spec}' were recorded in {env_id}, but task '{task.name}' needs "
-            f"{' or '.join(dict.fromkeys(fitting))}; choose the task that fits the data, or other data"
+            f"{' or '.join(dict.fromkeys(fitting))}; choose a task that fits the data, or other data"
         )
     return found
 
@@ -68,21 +68,23 @@ def load_trajectories(
     """Read and check a data set.
 
     Args:
-        spec: `local:DIR`, a folder with one Minari data set; `minari:ID`, a data set under
-            MINARI_DATASETS_PATH or ~/.minari/datasets; `d4rl:FILE`, a file of D4RL's, by path or by name;
-            `arrays:DIR`, what `Trajectories.save` wrote.
-        task: The task that the data must fit; None only checks that they are sound, and keeps recorded
-            rewards.
-        reward: "task" gives what the task's `data_reward` names: in mazes the reward of its one goal
-            (`relabel_to_goal`) or of the recording's (`cut_at_arrivals`), in the kitchen the number of subtasks
-            done (`relabel_subtasks`), elsewhere what was recorded. "recorded" keeps that everywhere.
+        spec: `local:DIR`, a folder with one Minari data set; `minari:ID`, a data set under MINARI_DATASETS_PATH or
+            ~/.minari/datasets; `d4rl:FILE`, one of D4RL's files, by path or by name; `arrays:DIR`, a folder that
+            `Trajectories.save` wrote.
+        task: The task that the data must fit; None only checks that they are valid, and keeps the recorded rewards.
+        reward: "task" gives what the task's `data_reward` names: in mazes the reward of its single goal
+            (`relabel_to_goal`) or of the recording's goal (`cut_at_arrivals`), in the kitchen the number of subtasks
+            done (`relabel_subtasks`), elsewhere the recorded rewards. "recorded" always keeps the recorded rewards.
+
+    Returns:
+        The data; their `task` is the variant that they were loaded for.
 
     Raises:
         UserError: For an unknown source.
-        DataError: For data that are damaged, incomplete or another task's.
+        DataError: For data that are damaged, incomplete or of another task.
     """
     if reward not in ("task", "recorded"):
-        raise UserError(f"reward: found '{reward}', expected 'task' or 'recorded'")
+        raise UserError(f"reward: got '{reward}', expected 'task' or 'recorded'")
     source, rest = parse_spec(spec)
     task = resolve_task(spec, task) if task is not None else None
     trajectories = source.load(rest, task)

@@ -59,7 +59,7 @@ def check_width(where: str, task: Task | None, observations: int, actions: int) 
         ("actions", actions, task.action_dim),
     ):
         if found != expected:
-            raise DataError(f"{where}, {name}: found {found} columns, task '{task.name}' needs {expected}")
+            raise DataError(f"{where}, {name}: got {found} columns, task '{task.name}' needs {expected}")
 
 
 @dataclass(frozen=True)

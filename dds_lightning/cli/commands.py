@@ -103,7 +103,7 @@ def relabel(
     out: str | None = None,
     **relabelling: Any,
 ) -> Report:
-    """Turn a data set into transitions between skills, and show how its codes are used.
+    """Turn a data set into transitions between skills, and show how the codes are used.
 
     Args:
         skill: skill checkpoint, a .ckpt file or a published directory

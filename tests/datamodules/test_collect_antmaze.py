@@ -165,9 +165,9 @@ def test_the_navigator_reaches_the_goal() -> None:
     [
         ({"task": "pointmaze-umaze-play"}, "cannot be collected here, expected a task of antmaze in d4rl physics"),
         ({"task": "antmaze-umaze@robotics"}, "cannot be collected here, expected a task of antmaze in d4rl physics"),
-        ({"steps": 0}, "steps: found 0"),
-        ({"seed": -1}, "seed: found -1"),
-        ({"workers": 0}, "workers: found 0"),
+        ({"steps": 0}, "steps: got 0"),
+        ({"seed": -1}, "seed: got -1"),
+        ({"workers": 0}, "workers: got 0"),
     ],
 )
 def test_settings_out_of_range_are_refused(options: dict[str, Any], message: str, tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ def test_medium_is_the_rung_nearest_to_42_percent_of_the_expert() -> None:
     assert list(mixture(ladder(), "medium")) == ["045"]
     assert list(mixture(ladder(), "medium-replay")) == ["001", "020", "045"]
     assert list(mixture(ladder(), "medium-expert")) == ["045", "100"]
-    with pytest.raises(UserError, match="quality: found 'random'"):
+    with pytest.raises(UserError, match="quality: got 'random'"):
         mixture(ladder(), "random")
 
 
@@ -103,8 +103,8 @@ def test_the_shipped_ladder_gives_medium_and_expert_scores(tmp_path: Path) -> No
     ("options", "message"),
     [
         ({"task": "kitchen-mixed"}, "expected a task of locomotion"),
-        ({"steps": 0}, "steps: found 0"),
-        ({"workers": 0}, "workers: found 0"),
+        ({"steps": 0}, "steps: got 0"),
+        ({"workers": 0}, "workers: got 0"),
     ],
 )
 def test_settings_out_of_range_are_refused(options: dict[str, Any], message: str, tmp_path: Path) -> None:

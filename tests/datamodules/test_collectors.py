@@ -175,8 +175,8 @@ def test_a_behaviour_acts_the_same_whichever_environments_have_finished(name: st
     ("task", "recipe", "message"),
     [
         ("antmaze-umaze", {"noise": 0.1}, r"recipe.noise: 'antmaze-umaze' has no such setting; it has action_noise, "),
-        ("antmaze-umaze", {"action_noise": -1}, "action_noise: found -1, expected"),
-        ("hopper-medium", {"action_noise": "much"}, "recipe.action_noise: found 'much', expected a number"),
+        ("antmaze-umaze", {"action_noise": -1}, "action_noise: got -1, expected"),
+        ("hopper-medium", {"action_noise": "much"}, "recipe.action_noise: got 'much', expected a number"),
         ("pointmaze-umaze-play", {"overwrite": True}, "recipe.overwrite: .* has no such setting; it has episode_steps"),
     ],
 )

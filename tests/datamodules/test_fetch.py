@@ -301,7 +301,7 @@ def test_a_path_that_is_not_there_is_named_with_what_is(tmp_path: Path) -> None:
 def test_a_task_without_data_there_says_what_it_has() -> None:
     with pytest.raises(UserError, match=r"task 'pointmaze-large-play' has no data set in source 'd4rl'; it has local:"):
         fetch("pointmaze-large-play")
-    with pytest.raises(UserError, match="source: found 'elsewhere', expected d4rl or minari"):
+    with pytest.raises(UserError, match="source: got 'elsewhere', expected d4rl or minari"):
         fetch("hopper-medium", "elsewhere")
 
 

@@ -99,21 +99,21 @@ FILES: dict[str, tuple[Spoil, str]] = {
     # types
     "objects": (
         _set(REWARDS, np.array([np.arange(2.0)] * STEPS + [None], object)[:-1], dtype=h5py.vlen_dtype(np.float64)),
-        "episode_1, rewards: found values of type object, expected real numbers",
+        "episode_1, rewards: got values of type object, expected real numbers",
     ),
-    "strings": (_set(REWARDS, ["os.system"] * STEPS), "rewards: found values of type object, expected real numbers"),
-    "short strings": (_set(REWARDS, np.array([b"0"] * STEPS)), r"rewards: found values of type \|S1"),
-    "references": (_declare(REWARDS, (STEPS,), h5py.ref_dtype), "rewards: found values of type object"),
-    "pickles": (_set(REWARDS, np.array([b"\x80\x04."] * STEPS, "V3")), r"rewards: found values of type \|V3"),
-    "records": (_set(REWARDS, np.zeros(STEPS, [("r", "f4"), ("x", "i4")])), "rewards: found values of type"),
-    "complex numbers": (_set(REWARDS, np.zeros(STEPS, complex)), "rewards: found values of type"),
-    "a type for an array": (_set(REWARDS, np.dtype("f8")), "rewards: found a group, expected an array"),
+    "strings": (_set(REWARDS, ["os.system"] * STEPS), "rewards: got values of type object, expected real numbers"),
+    "short strings": (_set(REWARDS, np.array([b"0"] * STEPS)), r"rewards: got values of type \|S1"),
+    "references": (_declare(REWARDS, (STEPS,), h5py.ref_dtype), "rewards: got values of type object"),
+    "pickles": (_set(REWARDS, np.array([b"\x80\x04."] * STEPS, "V3")), r"rewards: got values of type \|V3"),
+    "records": (_set(REWARDS, np.zeros(STEPS, [("r", "f4"), ("x", "i4")])), "rewards: got values of type"),
+    "complex numbers": (_set(REWARDS, np.zeros(STEPS, complex)), "rewards: got values of type"),
+    "a type for an array": (_set(REWARDS, np.dtype("f8")), "rewards: got a group, expected an array"),
     "names that a terminal obeys": (_orders, r"episode_1: 'rewards' is missing; found \?\[2J"),
-    "a group for an array": (_group, "rewards: found a group, expected an array"),
-    "an array for an episode": (_set("episode_1", np.zeros(3)), "episode_1: found an array, expected a group"),
+    "a group for an array": (_group, "rewards: got a group, expected an array"),
+    "an array for an episode": (_set("episode_1", np.zeros(3)), "episode_1: got an array, expected a group"),
     "an array for observations": (
         _set("episode_1/observations", np.zeros((STEPS + 1, 4))),
-        "episode_1, observations: found an array, expected a group",
+        "episode_1, observations: got an array, expected a group",
     ),
     # sizes
     "a size beyond the file": (
@@ -127,16 +127,16 @@ FILES: dict[str, tuple[Spoil, str]] = {
     "never written": (_declare(REWARDS, (STEPS,), "f8"), "rewards: it declares shape .* its file holds 0 bytes of it"),
     "a chunk never written": (_hole, "rewards: it declares shape .* in 2 blocks, but its file holds 1 of them"),
     "a filter from a plug-in": (_plugin, "rewards: it is stored with filter 32099, which needs a plug-in"),
-    "one number": (_set(REWARDS, 0.0), "rewards: found one value, expected an array"),
-    "no numbers": (_set(REWARDS, h5py.Empty("f8")), "rewards: found nothing, expected an array"),
+    "one number": (_set(REWARDS, 0.0), "rewards: got one value, expected an array"),
+    "no numbers": (_set(REWARDS, h5py.Empty("f8")), "rewards: got nothing, expected an array"),
     "no steps": (_set("episode_1/rewards", np.zeros(0)), "promises 40 steps, but .* holds 20"),
     "three axes": (
         _set("episode_1/observations/observation", np.zeros((STEPS + 1, 4, 1))),
-        r"observations/observation: found shape \(21, 4, 1\), expected \(steps, 4\)",
+        r"observations/observation: got shape \(21, 4, 1\), expected \(steps, 4\)",
     ),
     "another task's width": (
         _set("episode_1/observations/observation", np.zeros((STEPS + 1, 27))),
-        r"observations/observation: found shape \(21, 27\), expected \(steps, 4\)",
+        r"observations/observation: got shape \(21, 27\), expected \(steps, 4\)",
     ),
 }
 

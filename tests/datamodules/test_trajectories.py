@@ -87,7 +87,7 @@ def test_split_keeps_usable_episodes_on_both_sides(make_episode: Make) -> None:
         assert len(training) == 2
     with pytest.raises(DataError, match="1 of its episodes have 10 steps"):
         data.select([0, 1]).split(0.1, seed=0, horizon=10)
-    with pytest.raises(DataError, match=r"validation_fraction: found 1\.5"):
+    with pytest.raises(DataError, match=r"validation_fraction: got 1\.5"):
         data.split(1.5, seed=0)
 
 
