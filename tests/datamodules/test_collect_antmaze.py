@@ -178,5 +178,5 @@ def test_settings_out_of_range_are_refused(options: dict[str, Any], message: str
 
 @pytest.mark.parametrize("setting", [{"action_noise": -0.1}, {"waypoint_noise": 2.0}, {"episode_steps": 0}])
 def test_recipes_out_of_range_are_refused(setting: dict[str, Any]) -> None:
-    with pytest.raises(UserError, match=f"{next(iter(setting))}: found"):
+    with pytest.raises(UserError, match=f"{next(iter(setting))}: got"):
         AntMazeRecipe(**setting)

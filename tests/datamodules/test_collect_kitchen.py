@@ -86,7 +86,7 @@ def test_the_hand_gets_where_it_should_and_no_faster_than_it_may(env: gym.Env[An
         seen, *_ = env.step(arm.action(arm.velocity(aim, SCRIPTS["microwave"].posture), CLOSED))
         arm.see(kitchen_layout(seen["observation"]))
         points.append(arm.hand()[0])
-    distance, angle = arm.lacks(aim)
+    distance, angle = arm.error(aim)
     assert np.linalg.norm(distance) < 0.015
     assert np.linalg.norm(angle) < 0.05
     assert np.linalg.norm(np.diff(points, axis=0), axis=1).max() / STEP < 0.36

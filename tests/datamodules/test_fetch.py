@@ -131,7 +131,7 @@ def test_after_giving_up_a_second_call_goes_on(server: Server, tmp_path: Path, m
     monkeypatch.setattr(downloading, "ATTEMPTS", 1)
     server.cuts, server.cut_after = 1, 120_000
     with pytest.raises(
-        UserError, match=r"120,000 of 300,008 bytes came\); the 120,000 bytes that came are kept, the sa"
+        UserError, match=r"120,000 of 300,008 bytes arrived\); the 120,000 bytes that arrived are kept, and the sa"
     ):
         download(f"{server.url}/file.hdf5", tmp_path / "file.hdf5")
     assert _left(tmp_path) == ["file.hdf5.part", "file.hdf5.part.json"]
@@ -190,14 +190,16 @@ def test_a_part_of_something_else_is_not_gone_on_with(facts: str | None, server:
 
 def test_fewer_bytes_than_announced_are_no_file(server: Server, tmp_path: Path) -> None:
     server.announce = 50
-    with pytest.raises(UserError, match=r"file.hdf5 cannot be read \(.*; the .* bytes that came are kept"):
+    with pytest.raises(UserError, match=r"file.hdf5 cannot be read \(.*; the .* bytes that arrived are kept"):
         download(f"{server.url}/file.hdf5", tmp_path / "file.hdf5")
     assert not (tmp_path / "file.hdf5").exists()
 
 
 def test_another_page_in_its_place_is_deleted(server: Server, tmp_path: Path) -> None:
     server.files["/file.hdf5"] = b"<html>Log in to the network</html>"
-    with pytest.raises(UserError, match=r"sent is no HDF5 file \(it begins with b'<html>Lo'\) and was deleted"):
+    with pytest.raises(
+        UserError, match=r"sent something other than an HDF5 file, which was deleted; it began with b'<html>Lo'"
+    ):
         download(f"{server.url}/file.hdf5", tmp_path / "file.hdf5")
     assert not list(tmp_path.glob("*.part"))
 

@@ -132,7 +132,7 @@ SPOILT: dict[str, tuple[Spoil, str]] = {
     "no rewards": (lambda f: f.pop("rewards"), "'rewards' is missing; found actions, infos, observations"),
     "no observations": (lambda f: f.pop("observations"), "'observations' is missing; found actions"),
     "empty": (lambda f: [f.pop(key) for key in list(f)], "'observations' is missing; found nothing"),
-    "Minari's layout": (_minari, "laid out as Minari's files are, one group an episode; read it with local:DIR"),
+    "Minari's layout": (_minari, "it has the layout of Minari's files, one group per episode; read it with local:DIR"),
     "a group for an array": (_group, "observations: got a group, expected an array"),
     "flat observations": (_set("observations", np.zeros(660)), r"observations: got shape \(660,\), expected"),
     "two-dimensional rewards": (
@@ -215,7 +215,7 @@ SPOILT: dict[str, tuple[Spoil, str]] = {
     "no ends": (_no_ends, "terminals: none of the 60 rows is marked as an episode's last, .* no complete episode"),
     "nothing but ends": (
         lambda f: (_put("timeouts", slice(None), True)(f), _put("terminals", slice(None), False)(f)),
-        "observations: no row leads to another one, so it holds no complete episode",
+        "observations: no row leads to another one, so it has no complete episode",
     ),
 }
 
@@ -256,7 +256,7 @@ def test_a_truncated_file_is_refused(keep: float, tmp_path: Path) -> None:
 def test_what_is_no_hdf5_is_refused(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "page.hdf5"
     path.write_bytes(content)
-    with pytest.raises(DataError, match=r"page.hdf5 is truncated or damaged, or no HDF5 file at all"):
+    with pytest.raises(DataError, match=r"page.hdf5 is truncated or damaged, or not an HDF5 file at all"):
         load_trajectories(f"d4rl:{path}", HOPPER)
 
 
@@ -286,11 +286,11 @@ def test_random_changes_of_bytes_load_or_are_refused_in_a_sentence(tmp_path: Pat
 
 OTHERS = {
     "another maze": ("antmaze-large-play", "antmaze-umaze", "of the positions lie outside the corridors of task"),
-    "another physics": ("antmaze-umaze@robotics", "antmaze-umaze", "of another physics with other coordinates"),
+    "another physics": ("antmaze-umaze@robotics", "antmaze-umaze", "of other physics with other coordinates"),
     "another body of the same widths": ("halfcheetah-medium", "walker2d-medium", "median height is .* another body"),
     "the other way round": ("walker2d-medium", "halfcheetah-medium", "median height is .* another body"),
     "other subtasks": ("kitchen-mixed", "kitchen-partial", "column 41, but the goal of task 'kitchen-partial'"),
-    "other widths": ("kitchen-mixed", "antmaze-umaze", r"found shape \(60, 60\), expected \(rows, 29\) as task"),
+    "other widths": ("kitchen-mixed", "antmaze-umaze", r"got shape \(60, 60\), expected \(rows, 29\) as task"),
 }
 
 

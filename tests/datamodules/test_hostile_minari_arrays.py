@@ -95,7 +95,7 @@ FILES: dict[str, tuple[Spoil, str]] = {
         "'rewards' is stored in another file",
     ),
     "virtual dataset": (_virtual, "'rewards' is stored in another file"),
-    "observations that hold themselves": (_loop, "found the entries actions, .* expected 'observation'"),
+    "observations that hold themselves": (_loop, "got the entries actions, .* expected 'observation'"),
     # types
     "objects": (
         _set(REWARDS, np.array([np.arange(2.0)] * STEPS + [None], object)[:-1], dtype=h5py.vlen_dtype(np.float64)),
@@ -122,14 +122,14 @@ FILES: dict[str, tuple[Spoil, str]] = {
     ),
     "packed beyond belief": (
         _declare("episode_1/actions", (10**12, 2), chunks=(10**6, 2), compression="gzip"),
-        "actions: it declares shape .* is not believed",
+        "actions: it declares shape .* is not plausible",
     ),
     "never written": (_declare(REWARDS, (STEPS,), "f8"), "rewards: it declares shape .* its file holds 0 bytes of it"),
     "a chunk never written": (_hole, "rewards: it declares shape .* in 2 blocks, but its file holds 1 of them"),
     "a filter from a plug-in": (_plugin, "rewards: it is stored with filter 32099, which needs a plug-in"),
     "one number": (_set(REWARDS, 0.0), "rewards: got one value, expected an array"),
     "no numbers": (_set(REWARDS, h5py.Empty("f8")), "rewards: got nothing, expected an array"),
-    "no steps": (_set("episode_1/rewards", np.zeros(0)), "promises 40 steps, but .* holds 20"),
+    "no steps": (_set("episode_1/rewards", np.zeros(0)), "promises 40 steps, but .* has 20"),
     "three axes": (
         _set("episode_1/observations/observation", np.zeros((STEPS + 1, 4, 1))),
         r"observations/observation: got shape \(21, 4, 1\), expected \(steps, 4\)",

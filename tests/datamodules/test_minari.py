@@ -54,7 +54,7 @@ def test_a_set_of_another_task_is_refused_naming_both(minari_set: Write) -> None
     with pytest.raises(
         DataError,
         match=r"data 'local:.*set-v0' were recorded in PointMaze_Medium-v3, but task 'pointmaze-large-diverse' needs "
-        "PointMaze_Large-v3; choose the task that fits the data, or other data",
+        "PointMaze_Large-v3; choose a task that fits the data, or other data",
     ):
         load_trajectories(f"local:{folder}", LARGE)
 
@@ -107,7 +107,7 @@ SPOILT: dict[str, tuple[Callable[[h5py.File], None], str]] = {
         _set("episode_1", np.zeros(3)),
         "episode_1: got an array, expected a group",
     ),
-    "a gap": (_delete("episode_0"), "promises 2 episodes, but .* holds 1"),
+    "a gap": (_delete("episode_0"), "promises 2 episodes, but .* has 1"),
     "another name": (
         lambda file: file.move("episode_1", "episode_7"),
         "main_data.hdf5 has 2 episodes, but no episode_1",

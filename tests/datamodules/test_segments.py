@@ -126,7 +126,7 @@ def test_a_batch_larger_than_the_data_is_the_data() -> None:
     assert [len(b) for b in _epoch(_loader(batch_size=100, drop_last=True))] == [23]
     with pytest.raises(UserError, match="batch_size: got 0"):
         _loader(batch_size=0)
-    with pytest.raises(UserError, match="found 0 items for 1 processes"):
+    with pytest.raises(UserError, match="got 0 items for 1 processes"):
         _loader(size=0)
 
 
@@ -228,12 +228,12 @@ def test_memory_mapped_data_give_the_same_batches(data: Trajectories, tmp_path: 
 def test_the_task_alone_tells_the_shapes_and_how_to_get_data() -> None:
     module = SegmentDataModule(task="pointmaze-large-diverse")
     assert (module.observation_dim, module.action_dim) == (4, 2)
-    with pytest.raises(UserError, match=r"data: none was given for task .*`dds data collect pointmaze-large-diverse"):
+    with pytest.raises(UserError, match=r"data: none were given for task .*`dds data collect pointmaze-large-diverse"):
         module.setup()
 
 
 def test_neither_task_nor_data_is_an_error() -> None:
-    with pytest.raises(UserError, match="neither a task nor data were given"):
+    with pytest.raises(UserError, match="expected a task or data, got neither"):
         SegmentDataModule().setup()
 
 

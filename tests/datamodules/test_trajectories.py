@@ -47,7 +47,7 @@ def test_select_keeps_order_and_offsets(three: Trajectories) -> None:
     np.testing.assert_array_equal(part.lengths, [4, 5])
     np.testing.assert_array_equal(part.episode(0)["observations"], three.episode(2)["observations"])
     np.testing.assert_array_equal(part.episode(1)["rewards"], three.episode(0)["rewards"])
-    with pytest.raises(DataError, match="episode 7 was asked for"):
+    with pytest.raises(DataError, match="episode 7 was requested"):
         three.select([7])
     with pytest.raises(DataError, match="no episodes were selected"):
         three.select([])

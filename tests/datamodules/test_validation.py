@@ -94,7 +94,7 @@ FAULTS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     ),
     "missing key": (
         lambda e: e.pop("rewards"),
-        r"'rewards' is missing; expected observations, actions, rewards, terminations, truncations, found "
+        r"'rewards' is missing; expected observations, actions, rewards, terminations, truncations, got "
         r"observations, actions, terminations, truncations",
     ),
     "no steps": (lambda e: e.update({k: v[:0] for k, v in e.items()}), r"rewards: got 0 steps"),
@@ -128,7 +128,7 @@ def test_the_box_may_differ_by_dimension(make_episode: Make) -> None:
     data = Trajectories.from_episodes("wide", [episode], action_low=[-2, -1], action_high=[2, 1])
     np.testing.assert_array_equal(data.action_high, [2, 1])
     episode["actions"][:, 1] = 1.5
-    with pytest.raises(DataError, match=r"found 1\.5 at step 0, column 1, expected -1 to 1"):
+    with pytest.raises(DataError, match=r"got 1\.5 at step 0, column 1, expected -1 to 1"):
         Trajectories.from_episodes("wide", [episode], action_low=[-2, -1], action_high=[2, 1])
 
 

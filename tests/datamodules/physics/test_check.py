@@ -362,7 +362,7 @@ def test_a_recording_that_tells_nothing_is_refused(written: Write) -> None:
     [
         (lambda file: file.pop("actions"), "'actions' is missing"),
         (lambda file: _replace(file, "actions", h5py.SoftLink("/rewards")), "'actions' is a link to elsewhere"),
-        (lambda file: _replace(file, "observations", np.zeros((20, 4))), "found 4 columns, task 'hopper-medium' needs"),
+        (lambda file: _replace(file, "observations", np.zeros((20, 4))), "got 4 columns, task 'hopper-medium' needs"),
         (lambda file: _replace(file, "rewards", np.zeros(7)), "observations: got shape"),
         (lambda file: _replace(file, "infos", h5py.ExternalLink("other.hdf5", "/")), "'infos' is a link to elsewhere"),
     ],

@@ -71,7 +71,7 @@ def test_the_error_for_an_unknown_source_lists_the_known_ones(toy: str, spec: st
         return open_recording(spec, get_task(TASK), np.random.default_rng(0))
 
     for call in (lambda: load_trajectories(spec), lambda: stat_hash(spec), lambda: resolve_task(spec, TASK), opened):
-        with pytest.raises(UserError, match=rf"found '{spec}', expected one of local:DIR .*toy:NUMBER \(a toy\)"):
+        with pytest.raises(UserError, match=rf"got '{spec}', expected one of local:DIR .*toy:NUMBER \(a toy\)"):
             call()
 
 
