@@ -13,7 +13,7 @@ from datamodules.sources import load_trajectories
 from datamodules.sources.subtasks import subtasks_completed
 from datamodules.trajectories import Trajectories
 from dds_lightning.tasks import Task
-from dds_lightning.tasks.columns import action_names, observation_names
+from dds_lightning.tasks.bodies import action_names, observation_names
 
 BLOCK = 65_536
 """Rows that are processed together, so that a data set of a million steps is never copied as a whole."""

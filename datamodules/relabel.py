@@ -20,8 +20,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from rich.console import Console
-from rich.progress import track
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
@@ -30,6 +28,7 @@ from datamodules.partial_codes import PartialCodes
 from datamodules.relabelling import Discount as Discount
 from datamodules.relabelling import Relabelling
 from datamodules.trajectories import Trajectories
+from dds_lightning.console.progress import on_terminal, track
 from dds_lightning.errors import UserError
 from dds_lightning.saving.files import refuse_newer, written_whole
 from dds_lightning.skill import SkillModule
@@ -268,10 +267,9 @@ def relabel(
     batches = range(sum(map(len, codes)), len(starts), batch_size)
     was_training = skill.training
     skill.eval()
-    console = Console(stderr=True)
-    hidden = not (progress and console.is_terminal)
+    layout, shown = ("{task.description}", "bar", "percent", "remaining"), progress and on_terminal()
     try:
-        for first in track(batches, "relabelling", console=console, disable=hidden, transient=True):
+        for first in track(batches, layout, len(batches), "relabelling", shown=shown):
             codes.append(encode(slice(first, first + batch_size)))
             if partial is not None:
                 partial.write_if_due(codes)

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -83,7 +83,7 @@ class Trajectories:
     lengths: NDArray[np.int64]
     action_low: NDArray[np.float32]
     action_high: NDArray[np.float32]
-    task: Task | None = None
+    task: Task | None = field(default=None, kw_only=True)
 
     # ------------------------------------------------------------------ creating one
 

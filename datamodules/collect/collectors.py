@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dds_lightning.errors import UserError
-from dds_lightning.tasks import Task, get_task
+from dds_lightning.tasks import Task, get_task, known_task
 
 if TYPE_CHECKING:
     from datamodules.collect.collecting import Collector
@@ -101,7 +101,7 @@ def collection_command(folder: str | Path) -> str | None:
     """
     try:
         made = json.loads((Path(folder) / "data" / "metadata.json").read_text(encoding="utf-8"))["collection"]
-        task, steps, seed = get_task(made["task"]), int(made["steps"]), int(made["seed"])
+        task, steps, seed = known_task(str(made["task"])), int(made["steps"]), int(made["seed"])
     except (OSError, ValueError, KeyError, TypeError, UserError):
         return None
     collector = collector_of(task)

@@ -198,4 +198,9 @@ def test_a_collected_set_knows_the_command_that_makes_it_again(tmp_path: Path) -
     )
     (folder / "data" / "metadata.json").write_text('{"collection": {"task": "mine"}}')
     assert collection_command(folder) is None
+    code = tmp_path / "task.py"
+    code.write_text("raise SystemExit('a name in a file of a stranger was run')")
+    stranger = {"collection": {"task": str(code), "steps": 1, "seed": 0}}
+    (folder / "data" / "metadata.json").write_text(json.dumps(stranger))
+    assert collection_command(folder) is None
     assert collection_command(tmp_path) is None
