@@ -55,6 +55,29 @@ def test_the_public_names_import():
         _ = dds_lightning.no_such_name
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("mypy") is None, reason="mypy is in the extra: dev")
+def test_a_strict_type_checker_sees_the_types_of_the_public_names(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from datamodules import Trajectories\n"
+        "from dds_lightning import DDSAgent, get_task\n"
+        "reveal_type(DDSAgent.load('x'))\n"
+        "reveal_type(get_task('x').observation_dim)\n"
+        "reveal_type(Trajectories.from_episodes)\n"
+    )
+    command = [sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", "--ignore-missing-imports"]
+    environment = {"MYPYPATH": str(ROOT), "PATH": "/usr/bin:/bin"}
+    checked = subprocess.run(
+        [*command, str(script)], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert checked.returncode == 0, checked.stdout
+    revealed = re.findall(r'Revealed type is "(.*)"', checked.stdout)
+    assert revealed[0].endswith("dds_lightning.agent.DDSAgent")
+    assert revealed[1].endswith("int")
+    assert "Any" not in revealed[2].split("->")[1], "the result of from_episodes has a type"
+
+
 @pytest.mark.skipif(find_spec("hatchling") is None, reason="hatchling (extra: dev) builds the wheel")
 def test_the_wheel_holds_both_packages_and_the_configurations_and_runs(tmp_path):
     command = [sys.executable, "-m", "pip", "wheel", str(ROOT), "--no-deps", "--no-build-isolation"]
@@ -67,6 +90,7 @@ def test_the_wheel_holds_both_packages_and_the_configurations_and_runs(tmp_path)
     configs = (ROOT / "dds_lightning" / "configs").rglob("*.yaml")
     expected = {str(path.relative_to(ROOT)) for path in configs}
     expected |= {"dds_lightning/cli/__init__.py", "datamodules/segments.py"}
+    expected |= {"dds_lightning/py.typed", "datamodules/py.typed"}
     expected.add("datamodules/behaviours/shipped_policies/ant/d4rl.safetensors")
     assert expected <= names
     strangers = {name.split("/")[0] for name in names} - {"dds_lightning", "datamodules"}
