@@ -4,25 +4,27 @@ TASK   ?= pointmaze-large-diverse
 SEED   ?= 0
 VENV   ?= .venv
 BIN    := $(VENV)/bin
+# The versions that an environment is made of.
+CONSTRAINTS ?= constraints.txt
 # One worker plays a whole file, so that the data and models its tests share are made once.
 PYTEST_ARGS ?= -n auto --dist loadscope -m 'not faults'
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test faults lint format audit figures notebooks notebooks-env clean
+.PHONY: help demo test test-oldest test-python pin-oldest faults lint format audit figures notebooks notebooks-env clean
 
 help:  ## show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */\1|/' | awk -F'|' '{printf "  make %-14s %s\n", $$1, $$2}'
 
 # The editable install sees later changes of the source; only new requirements install again.
-$(VENV)/.installed: pyproject.toml constraints.txt
+$(VENV)/.installed: pyproject.toml $(CONSTRAINTS)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo 'make: Python 3.11 or newer is needed: make PYTHON=/path/to/python3.11' >&2; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --editable '.[dev]' --constraint constraints.txt
+	$(BIN)/python -m pip install --quiet --editable '.[dev]' --constraint $(CONSTRAINTS)
 	@touch $@
 
 $(VENV)/.notebooks: $(VENV)/.installed
-	$(BIN)/python -m pip install --quiet --editable '.[dev,notebooks]' --constraint constraints.txt
+	$(BIN)/python -m pip install --quiet --editable '.[dev,notebooks]' --constraint $(CONSTRAINTS)
 	@touch $@
 
 demo: $(VENV)/.installed  ## all stages on PointMaze-Large, about ten minutes on two cores
@@ -30,6 +32,21 @@ demo: $(VENV)/.installed  ## all stages on PointMaze-Large, about ten minutes on
 
 test: $(VENV)/.installed  ## the test suite
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+test-oldest:  ## the test suite with the oldest versions that pyproject.toml allows
+	$(MAKE) test VENV=$(VENV)-oldest CONSTRAINTS=constraints-oldest.txt
+
+test-python:  ## the test suite on another interpreter: make test-python PYTHON=python3.13
+	$(MAKE) test VENV=$(VENV)-$(notdir $(PYTHON))
+
+# uv resolves to the lowest versions. torch brings its own exact NVIDIA packages where a CUDA build is chosen.
+pin-oldest: $(VENV)/.installed  ## write constraints-oldest.txt anew, after changing a lower bound (needs a network)
+	$(BIN)/python -m pip install --quiet uv
+	{ sed -n '/^#/p' constraints-oldest.txt; \
+	  grep '^torch==' constraints.txt | $(BIN)/uv pip compile pyproject.toml --all-extras --quiet --no-header --no-annotate \
+	    --resolution lowest-direct --python-version 3.11 --constraint - | grep -vE '^(nvidia|cuda|triton)'; } \
+	  >constraints-oldest.tmp
+	mv constraints-oldest.tmp constraints-oldest.txt
 
 faults: $(VENV)/.installed  ## kill every stage at random moments, five minutes
 	$(BIN)/python -m pytest -s tests/faults
@@ -57,5 +74,5 @@ figures: $(VENV)/.installed  ## draw the figures of all shipped checkpoints anew
 notebooks-env: $(VENV)/.notebooks  ## add Jupyter to the environment
 
 clean:  ## remove the environment and caches; runs/ stays
-	rm -rf $(VENV) dist build .pytest_cache .ruff_cache .mypy_cache *.egg-info
+	rm -rf $(VENV) $(VENV)-* dist build .pytest_cache .ruff_cache .mypy_cache *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,5 +1,7 @@
 """The project as pip sees it: metadata, constraints, and the wheel."""
 
+import importlib
+import pkgutil
 import re
 import subprocess
 import sys
@@ -10,14 +12,15 @@ from pathlib import Path
 
 import pytest
 
+import datamodules
 import dds_lightning
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
-def _pins():
-    lines = (ROOT / "constraints.txt").read_text().splitlines()
+def _pins(file="constraints.txt"):
+    lines = (ROOT / file).read_text().splitlines()
     return dict(line.split("==") for line in lines if line and not line.startswith("#"))
 
 
@@ -39,6 +42,27 @@ def test_every_exact_version_is_inside_its_range():
     for line in (line for group in groups for line in group):
         requirement = Requirement(line)
         assert requirement.specifier.contains(_pins()[requirement.name.lower()]), line
+
+
+def test_the_oldest_versions_are_the_lower_bounds():
+    from packaging.requirements import Requirement
+    from packaging.version import Version
+
+    pins = {name.replace("_", "-"): Version(version) for name, version in _pins("constraints-oldest.txt").items()}
+    groups = [PROJECT["dependencies"], *PROJECT["optional-dependencies"].values()]
+    bounds = {}
+    for requirement in (Requirement(line) for group in groups for line in group):
+        (bound,) = [part.version for part in requirement.specifier if part.operator == ">="]
+        bounds[requirement.name.lower().replace("_", "-")] = Version(bound)
+    differing = {name: (bound, pins[name]) for name, bound in bounds.items() if pins[name] != bound}
+    assert set(differing) == {"torch"}, f"`make pin-oldest` after changing a lower bound: {differing}"
+
+
+def test_every_module_imports():
+    for package in (dds_lightning, datamodules):
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            if not module.name.endswith("__main__") and ".examples." not in module.name:  # both run when imported
+                importlib.import_module(module.name)
 
 
 def test_versions_known_to_be_bad_are_excluded():

@@ -97,7 +97,7 @@ class RolloutResult:
             if recorded[0].observations is not None:
                 arrays["observations"] = np.concatenate([path.observations for path in recorded])
             with written_whole(directory / _PATHS) as part, part.open("wb") as file:
-                np.savez_compressed(file, allow_pickle=False, **arrays)
+                np.savez_compressed(file, **arrays)
         else:
             (directory / _PATHS).unlink(missing_ok=True)  # of an earlier rollout
         return directory

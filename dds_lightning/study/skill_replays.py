@@ -56,5 +56,5 @@ def stored_replays(path: Path, task: Task, directory: Path) -> Arrays:
                 return {name: stored[name] for name in stored.files if name != "key"}
     arrays = replay_skills(task, DDSAgent.load(directory))
     with written_whole(path) as part, part.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, key=np.array(key), **arrays)
+        np.savez_compressed(file, key=np.array(key), **arrays)
     return arrays
