@@ -14,6 +14,7 @@ import pytest
 
 import datamodules
 import dds_lightning
+from dds_lightning.errors import UserError
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -61,8 +62,12 @@ def test_the_oldest_versions_are_the_lower_bounds():
 def test_every_module_imports():
     for package in (dds_lightning, datamodules):
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-            if not module.name.endswith("__main__") and ".examples." not in module.name:  # both run when imported
+            if module.name.endswith("__main__") or ".examples." in module.name:
+                continue  # a script, which runs when it is imported
+            try:
                 importlib.import_module(module.name)
+            except UserError as error:
+                assert "pip install 'dds-lightning[" in str(error), module.name  # an extra that is not installed
 
 
 def test_versions_known_to_be_bad_are_excluded():
