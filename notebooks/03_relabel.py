@@ -114,7 +114,7 @@ clip = recolouring()
 Image(data=clip, format="png")  # a GIF all the same: pages that know only "png" then play it too
 
 # %% [markdown]
-# ## One line of the table
+# ## One row of the table
 #
 # What remains of a segment is one row of a much shorter table (section 4.2): *in state $s_t$ skill $k$ was used, it
 # earned $R$ and led to $s_{t+h}$*, with
