@@ -13,7 +13,7 @@ from datamodules.sources import load_trajectories
 from datamodules.sources.subtasks import subtasks_completed
 from datamodules.trajectories import Trajectories
 from dds_lightning.tasks import Task, get_task
-from dds_lightning.tasks.columns import action_names, observation_names
+from dds_lightning.tasks.bodies import action_names, observation_names
 
 BLOCK = 65_536
 """Rows that are looked at together: a data set of a million steps is never copied as a whole."""

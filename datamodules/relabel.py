@@ -20,14 +20,13 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 import torch
-from rich.console import Console
-from rich.progress import track
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
 from datamodules.partial_codes import KeptCodes
 from datamodules.trajectories import Trajectories
+from dds_lightning.console.progress import on_terminal, track
 from dds_lightning.errors import UserError
 from dds_lightning.saving.files import refuse_newer, written_whole
 from dds_lightning.skill import SkillModule
@@ -274,10 +273,9 @@ def relabel(
     batches = range(sum(map(len, codes)), len(starts), batch_size)
     was_training = skill.training
     skill.eval()
-    console = Console(stderr=True)
-    hidden = not (progress and console.is_terminal)
+    layout, shown = ("{task.description}", "bar", "percent", "remaining"), progress and on_terminal()
     try:
-        for first in track(batches, "relabelling", console=console, disable=hidden, transient=True):
+        for first in track(batches, layout, len(batches), "relabelling", shown=shown):
             codes.append(encode(slice(first, first + batch_size)))
             if kept is not None:
                 kept.write_now_and_then(codes)

@@ -38,7 +38,8 @@ from dds_lightning.interpret.draw.drawing import draw_starts, draw_trail, draw_w
 from dds_lightning.interpret.draw.gif import Still, gif_bytes
 from dds_lightning.interpret.draw.palette import WALL
 from dds_lightning.interpret.measure.body import body_frames
-from dds_lightning.interpret.measure.replay import body_states, simulator
+from dds_lightning.interpret.measure.replay import simulator
+from dds_lightning.interpret.measure.states import body_states
 from dds_lightning.tasks import task_table
 
 # %% tags=["parameters"] quick={"STEPS": 3000, "ANT_STEPS": 30}

@@ -97,7 +97,7 @@ quantised = codebook(encoding)
 (quantised.vectors @ torch.tensor([3.0, -1.0])).sum().backward()  # a "decoder" whose gradient is (3, -1)
 print("what the decoder gets:    ", quantised.vectors.detach().numpy().round(2), "= vector", int(quantised.codes[0]))
 print("gradient at the encoding: ", encoding.grad.numpy(), "straight through")
-print(f"pulls: codebook {quantised.codebook_loss.item():.3f}, commitment {quantised.commitment_loss.item():.3f}")
+print(f"pulls: codebook {quantised.terms['codebook'].value:.3f}, commitment {quantised.terms['commitment'].value:.3f}")
 
 # %% [markdown]
 # ## The data

@@ -47,7 +47,8 @@ from dds_lightning.interpret.draw.rendering import render_frames
 from dds_lightning.interpret.draw.stitching import draw_timeline
 from dds_lightning.interpret.draw.strobe import body_clip, plot_strobes
 from dds_lightning.interpret.measure.body import body_frames
-from dds_lightning.interpret.measure.replay import body_states, simulator
+from dds_lightning.interpret.measure.replay import simulator
+from dds_lightning.interpret.measure.states import body_states
 from dds_lightning.rollout import Contestant, RolloutResult, rollout
 from dds_lightning.study.tables import readable, summary_table, wilson
 

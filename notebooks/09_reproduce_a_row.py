@@ -45,7 +45,8 @@ from dds_lightning.interpret.draw.dataset import plot_dataset
 from dds_lightning.interpret.draw.palette import skill_colour
 from dds_lightning.interpret.draw.strobe import body_clip, plot_strobes
 from dds_lightning.interpret.measure.body import body_frames
-from dds_lightning.interpret.measure.replay import body_states, simulator
+from dds_lightning.interpret.measure.replay import simulator
+from dds_lightning.interpret.measure.states import body_states
 from dds_lightning.interpret.measure.statistics import code_segments
 from dds_lightning.rollout import Contestant, rollout
 

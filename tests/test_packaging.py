@@ -121,6 +121,9 @@ def test_the_wheel_holds_both_packages_and_the_configurations_and_runs(tmp_path)
     expected = {str(path.relative_to(ROOT)) for path in configs}
     expected |= {"dds_lightning/cli/__init__.py", "datamodules/segments.py"}
     expected |= {"dds_lightning/py.typed", "datamodules/py.typed"}
+    templates = [path for package in ("dds_lightning", "datamodules") for path in (ROOT / package).rglob("*.jinja")]
+    assert len(templates) >= 3
+    expected |= {"dds_lightning/interpret/atlas.css", *(str(path.relative_to(ROOT)) for path in templates)}
     expected.add("datamodules/behaviours/shipped_policies/ant/d4rl.safetensors")
     assert expected <= names
     strangers = {name.split("/")[0] for name in names} - {"dds_lightning", "datamodules"}

@@ -188,12 +188,7 @@ def _parcel(recorder: EpisodeRecorder, rounds: range) -> list[Episode]:
 
 
 def _with_progress(episodes: Iterator[Episode], steps: int, title: str) -> Iterator[Episode]:
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from dds_lightning.console.progress import track
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("steps"))
-    with Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True)) as bar:
-        work = bar.add_task(title, total=steps)
-        for episode in episodes:
-            yield episode
-            bar.advance(work, len(episode["rewards"]))
+    layout = ("{task.description}", "bar", "count", "steps", "elapsed")
+    return track(episodes, layout, steps, title, lambda episode: len(episode["rewards"]), transient=False)

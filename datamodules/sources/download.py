@@ -1,4 +1,8 @@
-"""Downloads one file: with progress, on from where it was cut, and whole or not at all."""
+"""Downloads one file: with progress, resumed where it was cut off, and complete or not at all.
+
+None of the project's dependencies resumes a download from any server: urllib and torch.hub start from nothing again,
+and a data set of D4RL has hundreds of megabytes.
+"""
 
 from __future__ import annotations
 
@@ -214,15 +218,13 @@ def _copy(response: Any, file: BinaryIO, size: int | None, show: Show) -> None:
 
 @contextlib.contextmanager
 def _progress(name: str) -> Iterator[Show]:
-    """A bar on a terminal's standard error, two lines where that is a file."""
+    """A bar where standard error is a terminal, one line elsewhere."""
     if not sys.stderr.isatty():
         print(f"fetching {name}", file=sys.stderr, flush=True)
         yield lambda done, size: None
         return
-    from rich.console import Console
-    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+    from dds_lightning.console.progress import progress_bar
 
-    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
-    with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as progress:
-        line = progress.add_task(name, total=None)
-        yield lambda done, size: progress.update(line, completed=done, total=size)
+    layout = ("{task.description}", "bar", "bytes", "speed", "remaining")
+    with progress_bar(layout, None, name, transient=False) as update:
+        yield lambda done, size: update(completed=done, total=size)

@@ -1,8 +1,8 @@
 """Reads arrays of numbers from HDF5 files of strangers.
 
-HDF5 can point at other files of the reader's machine, load filters as plug-ins (which is foreign code), store
-Python objects, and declare arrays of any size in a few bytes. A file of trajectories needs none of that, so
-here only plain numbers are read, which the file itself holds, at the size that they have in it.
+HDF5 can point at other files on the reader's machine, load filters as plug-ins (which is foreign code), store
+Python objects, and declare arrays of any size in a few bytes. h5py and Minari allow all of that. A file of trajectories
+needs none of it, so this module reads only plain numbers that the file itself holds, at the size they have in it.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from datamodules.sources.fetch import find_d4rl
 from datamodules.sources.hdf5 import check_array, member, open_hdf5, read_array, read_rows
 from datamodules.sources.metadata import check_task, observation_layout, read_metadata
-from datamodules.sources.minari import data_folder
+from datamodules.sources.minari import minari_root
 from datamodules.trajectories import Trajectories
 from datamodules.validation import DataError
 from dds_lightning.tasks import Task
@@ -54,23 +54,28 @@ class Recording(Protocol):
 
 
 @contextlib.contextmanager
-def open_array_rows(directory: str, task: Task, rng: np.random.Generator) -> Iterator[Recording]:
-    """Open what `Trajectories.save` wrote; see `datamodules.sources.open_rows`."""
-    yield _Arrays(directory, task)
+def open_recording(spec: str, task: Task, rng: np.random.Generator) -> Iterator[Recording]:
+    """Open a data set for reading single rows.
 
+    Args:
+        spec: As in `load_trajectories`.
+        task: From `resolve_task`, whose observations and actions the recording has.
+        rng: Draws the episodes of a Minari set, which are read from `EPISODES` at most.
 
-@contextlib.contextmanager
-def open_d4rl_rows(name: str, task: Task, rng: np.random.Generator) -> Iterator[Recording]:
-    """Open one of D4RL's files; see `datamodules.sources.open_rows`."""
-    path = find_d4rl(name)
-    with open_hdf5(path, f"data set '{path.name}'") as file:
-        yield _D4RL(file, f"data set '{path.name}'", task)
-
-
-@contextlib.contextmanager
-def open_minari_rows(folder: Path, task: Task, rng: np.random.Generator) -> Iterator[Recording]:
-    """Open at most `EPISODES` episodes of a Minari data set; see `datamodules.sources.open_rows`."""
-    data = data_folder(folder)
+    Raises:
+        DataError: For data that are damaged or another task's, also while rows are read.
+    """
+    source, _, rest = spec.partition(":")
+    if source == "arrays":
+        yield _Arrays(rest, task)
+        return
+    if source == "d4rl":
+        path = find_d4rl(rest)
+        with open_hdf5(path, f"data set '{path.name}'") as file:
+            yield _D4RL(file, f"data set '{path.name}'", task)
+        return
+    folder = minari_root() / rest if source == "minari" else Path(rest).expanduser()
+    data = folder / "data" if (folder / "data").is_dir() else folder
     metadata = read_metadata(data)
     check_task(metadata, task)
     with open_hdf5(data / "main_data.hdf5", f"data set '{metadata['dataset_id']}'") as file:

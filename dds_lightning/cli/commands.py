@@ -49,7 +49,7 @@ def run(
     measured is null.
 
     Args:
-        task: name of a task; `dds tasks` lists them
+        task: name of a task (`dds tasks` lists them), a task file of your own (.yaml), or package.module:NAME
         out: folder of the run; without it runs/TASK
         data: your data, local:DIR, minari:ID, d4rl:FILE or arrays:DIR; without it data are collected in the environment
         seed: of everything random: data, both trainings and the evaluation
@@ -71,11 +71,12 @@ def run(
         **stages: settings for `dds STAGE fit` of each training stage, see above
     """
     from dds_lightning.pipeline.run import RunSettings, run_all
+    from dds_lightning.tasks import get_task
 
     return run_all(
         RunSettings.with_preset(
             task=task,
-            out=Path(out or f"runs/{task}"),
+            out=Path(out or f"runs/{get_task(task).name}"),
             data=data_spec(data) if data else None,
             seed=seed,
             preset=preset,

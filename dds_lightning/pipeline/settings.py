@@ -12,7 +12,7 @@ from jsonargparse import Namespace
 from dds_lightning.configs import RUN_DEFAULTS, run_defaults
 from dds_lightning.console.reports import Report
 from dds_lightning.errors import UserError
-from dds_lightning.tasks import Task, get_task
+from dds_lightning.tasks import Task, get_task, is_own
 from dds_lightning.training.stage_cli import StageCLI, command_line, parsed
 from dds_lightning.training.stages import STAGES, preset_configs
 
@@ -89,6 +89,7 @@ class Trainings:
 
     def __init__(self, wanted: RunSettings, task: Task) -> None:
         self.wanted, self.task = wanted, task
+        self.task_address = wanted.task if is_own(task) else task.name
         self.preset = preset_configs(wanted.preset or task.family)
         # How often the policy is evaluated follows from its steps, which only its parsed settings say.
         self.evaluate_every = self._asked_interval()
@@ -158,7 +159,7 @@ class Trainings:
         config = self.preset[stage]
         arguments = ["fit", *(["--config", str(config)] if config else [])]
         arguments += [f"--seed_everything={wanted.seed}", f"--data.seed={wanted.seed}"]
-        arguments += [f"--data.task={self.task.name}", f"--data.data={spec}"]
+        arguments += [f"--data.task={self.task_address}", f"--data.data={spec}"]
         if stage == "policy":
             checkpoint = skill or wanted.out / "skill" / "last.ckpt"
             arguments += [f"--data.skill={checkpoint}", f"--data.cache={wanted.out / 'relabel'}", *self._watching()]

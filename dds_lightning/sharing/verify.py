@@ -1,4 +1,4 @@
-"""Is a published directory what it says it is? Everything that `dds checkpoints verify` looks at."""
+"""Whether a published directory is what it claims to be: all checks of `dds checkpoints verify`."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from dds_lightning.errors import UserError
 from dds_lightning.saving.published import SUMS, load_published
 
 TOLERANCE = 1e-3
-"""Between the answers stored and given: processors and library versions round differently, weights that differ do
-more."""
+"""Largest difference between stored and computed answers: processors and library versions round differently, but other
+weights differ by more."""
 
 
 def verify_published(directory: str | Path) -> dict[str, Any]:
-    """Look at everything: file hashes, header, shapes, finite numbers, and the answers to fixed questions.
+    """Check everything: file hashes, header, shapes, finite numbers, and the answers to fixed questions.
 
     Args:
-        directory: as published.
+        directory: The published directory.
 
     Returns:
         Facts: `task`, `parameters`, `horizon`, `num_skills`, `golden` (largest difference from the stored answers;
         None for a directory that stores none).
 
     Raises:
-        UserError: at the first thing wrong; the message names the file.
+        UserError: A check fails; the message names the file.
     """
     published = load_published(directory)
     agent = DDSAgent.load(directory)
@@ -54,11 +54,11 @@ def _compare(directory: str | Path, stored: Any, given: dict[str, Any]) -> float
         try:
             expected = np.array(stored[name], dtype=np.float64)
         except (KeyError, TypeError, ValueError) as error:
-            raise UserError(f"{directory}: golden, {name}: found no table of numbers ({error!r})") from error
+            raise UserError(f"{directory}: golden, {name}: expected a table of numbers ({error!r})") from error
         if expected.shape != np.shape(answer):
             raise UserError(
                 f"{directory}: golden, {name}: found shape {expected.shape}, expected {np.shape(answer)}; the "
-                "directory's files are not of one agent"
+                "directory's files belong to different agents"
             )
         difference = float(np.abs(expected - np.array(answer)).max())
         if not difference <= TOLERANCE:
@@ -72,7 +72,7 @@ def _compare(directory: str | Path, stored: Any, given: dict[str, Any]) -> float
 
 
 def find_published(roots: Iterable[str | Path] = ("checkpoints", "runs")) -> pd.DataFrame:
-    """Published directories under some folders, without reading their weights.
+    """List published directories under some folders, without reading their weights.
 
     Returns:
         One row a directory: `checkpoint`, `task`, `score` (of the first contestant in metrics.json), `success`,

@@ -45,7 +45,7 @@ def test_by_id_from_minaris_folder(minari_set: Write, monkeypatch: pytest.Monkey
 
 @pytest.mark.parametrize("spec", ["", "local", "local:", "http://somewhere", "nowhere:x"])
 def test_an_unknown_source_lists_those_there_are(spec: str) -> None:
-    with pytest.raises(UserError, match=r"data is '.*', expected one of .*local:..., .*minari:..., .*arrays:..."):
+    with pytest.raises(UserError, match=r"data: found '.*', expected one of .*local:..., .*minari:..., .*arrays:..."):
         load_trajectories(spec, LARGE)
 
 

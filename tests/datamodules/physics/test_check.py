@@ -14,12 +14,13 @@ import pytest
 
 from datamodules import load_trajectories
 from datamodules.physics.check import LIMIT, NOISY_LIMIT, replay_check
-from datamodules.physics.states import FALLS, draw_steps, state_layout
+from datamodules.physics.states import FALLS, draw_steps
 from datamodules.sources import rows as recordings
 from datamodules.validation import DataError
 from dds_lightning.cli import main
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import get_task
+from dds_lightning.tasks.bodies import state_layout
 from tests.minari_recordings import write_minari_set
 from tests.recordings import Episode, record, write_d4rl_file
 
