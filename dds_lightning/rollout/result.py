@@ -90,7 +90,7 @@ class RolloutResult:
         if self.paths:
             keys = list(zip(table["actor"], table["episode"], strict=True))
             recorded = [self.paths[key] for key in keys]
-            arrays = {
+            arrays: dict[str, Any] = {
                 "positions": np.concatenate([path.positions for path in recorded]),
                 "codes": np.concatenate([path.codes for path in recorded]),
             }
