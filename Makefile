@@ -40,7 +40,7 @@ test-python:  ## the test suite on another interpreter: make test-python PYTHON=
 	$(MAKE) test VENV=$(VENV)-$(notdir $(PYTHON))
 
 # uv resolves to the lowest versions. torch brings its own exact NVIDIA packages where a CUDA build is chosen.
-pin-oldest: $(VENV)/.installed  ## write constraints-oldest.txt anew, after changing a lower bound (needs a network)
+pin-oldest: $(VENV)/.installed  ## rewrite constraints-oldest.txt after changing a lower bound (needs a network)
 	$(BIN)/python -m pip install --quiet uv
 	{ sed -n '/^#/p' constraints-oldest.txt; \
 	  grep '^torch==' constraints.txt | $(BIN)/uv pip compile pyproject.toml --all-extras --quiet --no-header --no-annotate \
@@ -51,24 +51,24 @@ pin-oldest: $(VENV)/.installed  ## write constraints-oldest.txt anew, after chan
 faults: $(VENV)/.installed  ## kill every stage at random moments, five minutes
 	$(BIN)/python -m pytest -s tests/faults
 
-lint: $(VENV)/.installed  ## ruff and mypy, changing nothing
+lint: $(VENV)/.installed  ## ruff and mypy, without changing files
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-format: $(VENV)/.installed  ## let ruff mend what it can
+format: $(VENV)/.installed  ## let ruff fix what it can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# Not of the environment's own extras: who only trains and tests needs no auditor.
+# Not in an extra: training and testing do not need an auditor.
 audit: $(VENV)/.installed  ## look every pinned version up among known vulnerabilities (needs a network)
 	$(BIN)/python -m pip install --quiet 'pip-audit>=2.7' --constraint constraints.txt
 	$(BIN)/pip-audit --requirement constraints.txt --no-deps --disable-pip --strict --progress-spinner off
 
-notebooks: $(VENV)/.notebooks  ## execute all notebooks anew, under 45 minutes
+notebooks: $(VENV)/.notebooks  ## execute all notebooks again, under 45 minutes
 	$(BIN)/python notebooks/execute.py
 
-figures: $(VENV)/.installed  ## draw the figures of all shipped checkpoints anew
+figures: $(VENV)/.installed  ## redraw the figures of all shipped checkpoints
 	$(BIN)/python benchmarks/draw_figures.py
 
 notebooks-env: $(VENV)/.notebooks  ## add Jupyter to the environment
