@@ -41,7 +41,7 @@ class PartialCodes:
         """Store the codes so far, (n,) each."""
         if codes:
             with written_whole(self.path) as part, part.open("wb") as file:
-                np.savez(file, allow_pickle=False, codes=torch.cat(codes).numpy(), key=np.array(self.key))
+                np.savez(file, codes=torch.cat(codes).numpy(), key=np.array(self.key))
         self._written = time.monotonic()
 
     def write_if_due(self, codes: list[Tensor]) -> None:

@@ -106,7 +106,7 @@ class PartialRecording:
         """Store a chunk atomically."""
         arrays = {f"{i}/{name}": array for i, episode in enumerate(episodes) for name, array in _flat(episode)}
         with written_whole(self._path(first)) as part, part.open("wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
+            np.savez(file, **arrays)
 
     def read(self, first: int) -> list[Episode]:
         """The episodes of the chunk that begins with round `first`."""

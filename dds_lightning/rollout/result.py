@@ -90,14 +90,14 @@ class RolloutResult:
         if self.paths:
             keys = list(zip(table["actor"], table["episode"], strict=True))
             recorded = [self.paths[key] for key in keys]
-            arrays = {
+            arrays: dict[str, Any] = {
                 "positions": np.concatenate([path.positions for path in recorded]),
                 "codes": np.concatenate([path.codes for path in recorded]),
             }
             if recorded[0].observations is not None:
                 arrays["observations"] = np.concatenate([path.observations for path in recorded])
             with written_whole(directory / _PATHS) as part, part.open("wb") as file:
-                np.savez_compressed(file, allow_pickle=False, **arrays)
+                np.savez_compressed(file, **arrays)
         else:
             (directory / _PATHS).unlink(missing_ok=True)  # of an earlier rollout
         return directory

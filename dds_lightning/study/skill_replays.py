@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +56,7 @@ def stored_replays(path: Path, task: Task, directory: Path) -> Arrays:
             if str(stored.get("key")) == key:
                 return {name: stored[name] for name in stored.files if name != "key"}
     arrays = replay_skills(task, DDSAgent.load(directory))
+    entries: dict[str, Any] = {"key": np.array(key), **arrays}
     with written_whole(path) as part, part.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, key=np.array(key), **arrays)
+        np.savez_compressed(file, **entries)
     return arrays
