@@ -61,6 +61,7 @@ from datamodules.trajectories import Trajectories
 from datamodules.validation import DataError, finite, in_box
 from datamodules.windows import ranges
 from dds_lightning.tasks import Task
+from dds_lightning.tasks.bodies import body_of
 
 FIELDS = ("observations", "actions", "rewards", "terminals")
 """Arrays of every file."""
@@ -181,7 +182,7 @@ def _read(file: h5py.File, where: str, task: Task | None, low: float, high: floa
     if task is not None:
         refuse_other_task(where, observations, task)
     # Without a task the widths decide: no other body of the table has them.
-    walks_on = task.family == "antmaze" if task else (observations.shape[1], actions.shape[1]) == (29, 8)
+    walks_on = body_of(task).walks_on if task else (observations.shape[1], actions.shape[1]) == (29, 8)
 
     last = timeouts.copy() if walks_on else timeouts | terminals
     last[-1] = True
@@ -313,7 +314,7 @@ class _D4RLRows:
         self.inner_state = self._inner_state(file, count)
         flags = {key: read_array(self.fields[key], f"{where}, {key}").reshape(-1) > 0 for key in keys[3:]}
         # D4RL's ants walk on through the goal, where rewards and terminals were computed afterwards.
-        last = flags.get("timeouts", np.zeros(count, bool)) | (flags["terminals"] & (task.family != "antmaze"))
+        last = flags.get("timeouts", np.zeros(count, bool)) | (flags["terminals"] & (not body_of(task).walks_on))
         last[-1:] = True
         ends = np.flatnonzero(last)
         self.first = np.append(0, ends[:-1] + 1)

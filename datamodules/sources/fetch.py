@@ -12,12 +12,10 @@ from datamodules.validation import DataError
 from dds_lightning.errors import UserError
 from dds_lightning.saving.files import neighbours
 from dds_lightning.tasks import Task, get_task, task_names
+from dds_lightning.tasks.bodies import body_of
 
 D4RL_SERVER = "http://rail.eecs.berkeley.edu/datasets/offline_rl"
 """D4RL's public server. It offers neither encryption nor hashes; files are checked when they are read."""
-
-D4RL_SETS = {"locomotion": ("gym_mujoco_v2", "v2"), "antmaze": ("ant_maze_v2", "v2"), "kitchen": ("kitchen", "v0")}
-"""Family -> folder on D4RL's server, and the version that D4RL's names of its files end in."""
 
 MINARI_SERVER = "https://huggingface.co/datasets/farama-minari"
 """Where Minari publishes its data sets: a repository per name space, a folder per data set."""
@@ -56,7 +54,7 @@ def fetch_d4rl(task: Task, folder: str | Path | None = None) -> Path:
         UserError: See `datamodules.sources.download.download`.
     """
     name = _published(task, "d4rl")
-    url = f"{D4RL_SERVER}/{D4RL_SETS[task.family][0]}/{quote(name)}"
+    url = f"{D4RL_SERVER}/{_d4rl(task)[0]}/{quote(name)}"
     return download(url, Path(folder or d4rl_root()).expanduser() / name)
 
 
@@ -140,4 +138,11 @@ def _names(task: Task) -> tuple[str, ...]:
     file = task.data_ids.get("d4rl")
     if file is None:
         return ()
-    return file, file.removesuffix(".hdf5"), task.name, f"{task.name}-{D4RL_SETS[task.family][1]}"
+    return file, file.removesuffix(".hdf5"), task.name, f"{task.name}-{_d4rl(task)[1]}"
+
+
+def _d4rl(task: Task) -> tuple[str, str]:
+    """Folder on D4RL's server, and the version that the names of its files end in."""
+    found = body_of(task).d4rl
+    assert found is not None, "a row with a D4RL file has a robot of D4RL's"
+    return found

@@ -20,13 +20,14 @@ from numpy.typing import NDArray
 
 from datamodules.sources.hdf5 import MAX_RATIO, SMALL, array_in, check_array, group_in, member, open_hdf5, read_rows
 from datamodules.sources.metadata import action_box, check_task, observation_layout, one_line, read_metadata
-from datamodules.sources.observations import Layout, Part
+from datamodules.sources.observations import Layout
 from datamodules.sources.source import Recording, Source
 from datamodules.trajectories import Trajectories
 from datamodules.validation import FIELDS, DataError, validate_episode
 from dds_lightning.errors import UserError
 from dds_lightning.saving.files import mend_folder
 from dds_lightning.tasks import Task
+from dds_lightning.tasks.bodies import Part
 
 Fields = dict[str, Any]
 

@@ -20,34 +20,17 @@ from numpy.typing import NDArray
 
 from dds_lightning.envs.kitchen import goal_vector, kitchen_layout
 from dds_lightning.tasks import Task
+from dds_lightning.tasks.bodies import BODIES, Part, body_name
 
-
-class Part(NamedTuple):
-    """One array of a dictionary observation.
-
-    Attributes:
-        widths: Widths that it may have.
-        columns: How many columns are read, from the first on.
-    """
-
-    widths: tuple[int, ...]
-    columns: int
-
-
-PARTS: dict[str, dict[str, Part]] = {
-    "flat": {},
-    "pointmaze": {"observation": Part((4,), 4)},
-    "antmaze": {"achieved_goal": Part((2,), 2), "observation": Part((27, 105), 27)},
-    "kitchen": {"observation": Part((59,), 59)},
-}
-"""Layout -> the arrays that are read from a dictionary; none where the observation is one array."""
+FLAT = "flat"
+"""Layout of observations that are one array."""
 
 
 class Layout(NamedTuple):
     """How the observations of one recording are flattened.
 
     Attributes:
-        name: A key of `PARTS`.
+        name: `FLAT`, or a robot of `tasks.bodies`.
         width: O of flat observations; None accepts any.
         subtasks: In the kitchen, the subtasks of the goal.
     """
@@ -57,9 +40,9 @@ class Layout(NamedTuple):
     subtasks: Sequence[str] = ()
 
     @property
-    def parts(self) -> dict[str, Part]:
+    def parts(self) -> Mapping[str, Part]:
         """The arrays that are read from a dictionary; none where the observation is one array."""
-        return PARTS[self.name]
+        return {} if self.name == FLAT else BODIES[self.name].parts
 
     def fits(self, space: Mapping[str, Any]) -> bool:
         """Whether the observations of a space (Minari's JSON) have this layout."""
@@ -94,12 +77,13 @@ class Layout(NamedTuple):
 
 def task_layout(task: Task) -> Layout:
     """The layout of recordings of a task's environments."""
-    return Layout("flat" if task.adapter == "flat" else task.family, task.observation_dim, task.subtasks)
+    return Layout(FLAT if task.adapter == "flat" else body_name(task), task.observation_dim, task.subtasks)
 
 
 def find_layout(space: Mapping[str, Any], subtasks: Sequence[str]) -> Layout | None:
     """The layout of a space when the task is unknown; None if it is not one of ours."""
-    return next((layout for name in PARTS if (layout := Layout(name, subtasks=subtasks)).fits(space)), None)
+    names = (FLAT, *(name for name, body in BODIES.items() if body.parts))
+    return next((layout for name in names if (layout := Layout(name, subtasks=subtasks)).fits(space)), None)
 
 
 def describe_space(space: Mapping[str, Any]) -> str:

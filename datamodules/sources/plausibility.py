@@ -8,12 +8,10 @@ from numpy.typing import NDArray
 from datamodules.validation import DataError
 from dds_lightning.envs.kitchen import goal_vector
 from dds_lightning.tasks import Task
+from dds_lightning.tasks.bodies import body_of
 
 IN_WALLS = 0.05
 """Share of positions that may lie in walls. None do, but maps may be drawn with a margin."""
-
-HEIGHTS = {"walker2d": (0.8, 2.0), "halfcheetah": (-1.0, 0.8)}
-"""Heights of two bodies whose observations and actions have the same widths: a walker below 0.8 m has fallen."""
 
 SAMPLE = 100_000
 """Rows that are inspected."""
@@ -34,9 +32,9 @@ def refuse_other_task(where: str, observations: NDArray[np.float32], task: Task)
     rows = observations[:: max(1, len(observations) // SAMPLE)]
     if task.maze_map is not None:
         _refuse_other_maze(where, rows, task)
-    if task.family == "kitchen":
+    if task.subtasks:
         _refuse_other_subtasks(where, rows, task)
-    low, high = HEIGHTS.get(task.base_name.partition("-")[0], (-np.inf, np.inf))
+    low, high = body_of(task).heights
     height = float(np.median(rows[:, 0]))
     if not low <= height <= high:
         raise DataError(
