@@ -151,7 +151,8 @@ def export(
 def _summary(fact: dict[str, Any]) -> str:
     golden = fact["golden"]
     answers = "it stores no answers to compare" if golden is None else f"answers as published (within {golden:.1g})"
-    return f"task {fact['task']}, {fact['parameters']:,} parameters, {fact['num_skills']} skills; {answers}"
+    holds = f"{fact['num_skills']} skills" if fact["num_skills"] else f"a {' and a '.join(fact['stages'])} model"
+    return f"task {fact['task']}, {fact['parameters']:,} parameters, {holds}; {answers}"
 
 
 def _text(card: str) -> str:

@@ -11,7 +11,8 @@ import pandas as pd
 
 from dds_lightning.agent import DDSAgent
 from dds_lightning.errors import UserError
-from dds_lightning.saving.published import SUMS, load_published
+from dds_lightning.saving.published import SUMS, Published, load_published
+from dds_lightning.training.stages import STAGES, Stage
 
 TOLERANCE = 1e-3
 """Largest difference between stored and computed answers: processors and library versions round differently, but other
@@ -25,27 +26,39 @@ def verify_published(directory: str | Path) -> dict[str, Any]:
         directory: The published directory.
 
     Returns:
-        Facts: `task`, `parameters`, `horizon`, `num_skills`, `golden` (largest difference from the stored answers;
-        None for a directory that stores none).
+        Facts: `task`, `stages` (of its modules), `parameters`, `horizon` and `num_skills` (None without an agent),
+        `golden` (largest difference from the stored answers; None for a directory that stores none).
 
     Raises:
         UserError: A check fails; the message names the file.
     """
     published = load_published(directory)
-    agent = DDSAgent.load(directory)
+    modules = {name: published.module(stage.module_class(), name) for name, stage in _stages(published)}
+    if not modules:
+        raise UserError(f"{directory} holds no module of a training stage, expected some of {', '.join(STAGES)}")
     facts: dict[str, Any] = {
         "directory": str(directory),
         "task": published.config.get("task"),
+        "stages": list(modules),
         "format": published.config["format_version"],
-        "parameters": sum(parameter.numel() for parameter in agent.parameters()),
-        "horizon": agent.horizon,
-        "num_skills": agent.num_skills,
+        "parameters": sum(value.numel() for module in modules.values() for value in module.parameters()),
+        "horizon": None,
+        "num_skills": None,
         "golden": None,
     }
+    if "skill" not in modules:
+        return facts
+    agent = DDSAgent.load(directory)
+    facts |= {"horizon": agent.horizon, "num_skills": agent.num_skills}
     stored = published.config.get("golden")
     if stored is not None:
         facts["golden"] = _compare(directory, stored, agent.golden())
     return facts
+
+
+def _stages(published: Published) -> list[tuple[str, Stage]]:
+    """The registered training stages whose modules a directory holds."""
+    return [(name, stage) for name, stage in STAGES.items() if isinstance(published.config.get(name), dict)]
 
 
 def _compare(directory: str | Path, stored: Any, given: dict[str, Any]) -> float:
