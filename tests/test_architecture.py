@@ -50,11 +50,13 @@ ROOMS = {
     "datamodules.inspection": "tasks datamodules.sources datamodules.trajectories",
     "datamodules.listing": "errors tasks datamodules.sources datamodules.storage datamodules.trajectories",
     "datamodules.partial_codes": "saving",
-    "datamodules.relabel": "console errors saving skill datamodules.partial_codes datamodules.trajectories",
+    "datamodules.relabelling": "errors tasks",
+    "datamodules.relabel": "console errors saving skill datamodules.partial_codes datamodules.relabelling "
+    "datamodules.trajectories",
     "datamodules.segments": "errors nn tasks datamodules.collect datamodules.loader datamodules.sources "
     "datamodules.trajectories",
     "datamodules.relabelled": "errors skill tasks datamodules.loader datamodules.partial_codes datamodules.relabel "
-    "datamodules.sources datamodules.trajectories",
+    "datamodules.relabelling datamodules.sources datamodules.trajectories",
     # training
     "dds_lightning.callbacks": "agent console envs errors policy rollout skill tasks",
     "dds_lightning.training": "callbacks configs console errors finetune module saving tasks",
@@ -71,10 +73,11 @@ ROOMS = {
     "saving skill tasks datamodules.collect datamodules.relabel datamodules.sources",
     "dds_lightning.sharing": "agent errors saving tasks training",
     "dds_lightning.pipeline": "agent baselines configs console errors policy rollout saving skill study tasks training "
-    "datamodules.collect datamodules.inspection datamodules.relabelled datamodules.relabel datamodules.sources",
+    "datamodules.collect datamodules.inspection datamodules.relabelled datamodules.relabelling datamodules.relabel "
+    "datamodules.sources",
     "dds_lightning.cli": "_version agent console errors interpret.draw pipeline policy saving sharing skill study "
     "tasks training datamodules.collect datamodules.inspection datamodules.listing datamodules.physics "
-    "datamodules.relabel datamodules.relabelled datamodules.sources",
+    "datamodules.relabel datamodules.relabelled datamodules.relabelling datamodules.sources",
     "dds_lightning.__main__": "cli",
 }
 """Room -> those it may import, apart from itself; `dds_lightning.` is left out in the second column."""

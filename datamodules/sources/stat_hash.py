@@ -1,4 +1,4 @@
-"""Telling given data from changed ones without reading them."""
+"""Notices that a data set has changed without reading it: names, sizes and times of its files."""
 
 from __future__ import annotations
 
@@ -6,40 +6,39 @@ import hashlib
 import json
 from pathlib import Path
 
-from datamodules.sources import SOURCES
-from datamodules.sources.fetch import find_d4rl
-from datamodules.sources.minari import minari_root
+from datamodules.sources import parse_spec
 from dds_lightning.errors import UserError
 
 
-def signature(spec: str) -> str:
-    """Hash of the names, sizes and times of a data set's files.
+def stat_hash(spec: str) -> str:
+    """Hash of the names, sizes and modification times of a data set's files.
 
     Args:
         spec: As in `load_trajectories`.
 
     Raises:
-        UserError: An unknown source, or nothing is there.
+        UserError: For an unknown source, or when the data set does not exist.
     """
-    place = locate(spec)
-    files = [place] if place.is_file() else sorted(entry for entry in place.rglob("*") if entry.is_file())
-    facts = [(str(f.relative_to(place)), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
+    path = locate(spec)
+    files = [path] if path.is_file() else sorted(entry for entry in path.rglob("*") if entry.is_file())
+    facts = [(str(f.relative_to(path)), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
     return hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:16]
+
+
+signature = stat_hash
+"""Name in earlier versions."""
 
 
 def locate(spec: str) -> Path:
     """The file or folder of a data set.
 
     Raises:
-        UserError: An unknown source, or nothing is there.
+        UserError: For an unknown source, or when the data set does not exist.
     """
-    source, _, rest = spec.partition(":")
-    place = Path(rest).expanduser()
-    if source == "minari":
-        place = minari_root() / rest
-    elif source == "d4rl" and rest:
-        place = find_d4rl(rest)
-    if source not in SOURCES or not rest or not place.exists():
-        expected = ", ".join(f"{name}:..." for name in SOURCES)
-        raise UserError(f"data: there is nothing at {place} (from '{spec}'); expected one of {expected}")
-    return place
+    source, rest = parse_spec(spec)
+    path = source.locate(rest)
+    if not path.exists():
+        raise UserError(
+            f"data: '{spec}' should be at {path}, but there is nothing at that path; expected {source.about}"
+        )
+    return path

@@ -68,9 +68,9 @@ class Run:
             refuse_uncollectable(self.task)
             return None
         from datamodules.sources import resolve_task
-        from datamodules.sources.stat_hash import signature
+        from datamodules.sources.stat_hash import stat_hash
 
-        files = signature(spec)
+        files = stat_hash(spec)
         self.task = resolve_task(spec, self.task)
         return files
 

@@ -3,12 +3,13 @@
 import json
 import shlex
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 from jsonargparse import Namespace
 
+from datamodules.relabelling import Relabelling
 from dds_lightning.configs import RUN_DEFAULTS, run_defaults
 from dds_lightning.console.reports import Report
 from dds_lightning.errors import UserError
@@ -203,8 +204,7 @@ class Trainings:
     def relabelling(self) -> dict[str, Any]:
         """The settings of relabelling, which are the policy's data's."""
         data = self._parsed["policy"].settings.data
-        names = ("gamma", "discount", "stride", "reward_scale", "reward_shift")
-        return {name: data[name] for name in names}
+        return {one.name: data[one.name] for one in fields(Relabelling)}
 
     # ---------------------------------------------------------------- doing it
 

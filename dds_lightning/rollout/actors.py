@@ -108,34 +108,6 @@ class AgentGroup:
         return Acted(lead.decode(x, in_use), in_use, np.concatenate(chosen))
 
 
-class EveryRow:
-    """Lets an actor that always acts in all of its environments play on when some of them have finished.
-
-    Args:
-        actor: With `reset(num_envs, seed)` and `act(observations, restarted)`.
-    """
-
-    def __init__(self, actor: Any) -> None:
-        self.actor = actor
-        self.num_envs = 0
-        self._last: NDArray[np.float32] | None = None
-
-    def reset(self, num_envs: int, seed: int | None = None) -> None:
-        """As `Actor.reset`."""
-        self.actor.reset(num_envs, seed)
-        self.num_envs, self._last = num_envs, None
-
-    def act(
-        self, observations: NDArray[np.float32], restarted: NDArray[np.bool_], rows: NDArray[np.intp]
-    ) -> NDArray[np.float32]:
-        """As `Actor.act`: finished environments are shown their last observation, and their action is dropped."""
-        if self._last is None:
-            self._last = np.zeros((self.num_envs, observations.shape[1]), np.float32)
-        begun = np.zeros(self.num_envs, bool)
-        self._last[rows], begun[rows] = observations, restarted
-        return self.actor.act(self._last, begun)[rows]
-
-
 @dataclass(frozen=True)
 class Contestant:
     """Who plays, and how often.

@@ -73,7 +73,7 @@ def rollout(
         UserError: Contestants that cannot play; the message names them.
         EnvPoolError: An environment failed.
     """
-    task = get_task(task) if isinstance(task, str) else task
+    task = get_task(task)
     check_contestants(contestants)
     if slots < 1:
         raise UserError(f"slots is {slots}, expected at least 1")

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dds_lightning.errors import UserError
-from dds_lightning.rollout.actors import Contestant, EveryRow, single_skills
+from dds_lightning.rollout.actors import Contestant, single_skills
 from dds_lightning.tasks import Task
 
 if TYPE_CHECKING:
@@ -91,25 +91,10 @@ def final_table(
 
 
 def behaviour_controller(task: Task) -> Any:
-    """Return the actor that collected a data set, with the noise it had there; None for other data."""
-    if task.family == "pointmaze":
-        from datamodules.collect.behaviour import BehaviourNoise
-        from datamodules.collect.pointmaze import WaypointController
+    """The actor that made a collected set, with the noise that it had there; None if there is no collector."""
+    from datamodules.collect.collectors import behaviour_actor
 
-        return EveryRow(WaypointController(task, BehaviourNoise()))
-    if task.family == "antmaze" and task.physics == "d4rl":
-        from datamodules.collect.antmaze import AntMazeRecipe, AntNavigator
-
-        return EveryRow(AntNavigator(task, AntMazeRecipe()))
-    if task.family == "kitchen":
-        from datamodules.collect.kitchen import KitchenDemonstrator, KitchenRecipe
-
-        return EveryRow(KitchenDemonstrator(task, KitchenRecipe()))
-    if task.family == "locomotion":
-        from datamodules.collect.locomotion import Runners
-
-        return EveryRow(Runners(task))
-    return None
+    return behaviour_actor(task)
 
 
 BEST_AGENT = Path("evaluate", "best")

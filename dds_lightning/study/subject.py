@@ -108,7 +108,7 @@ def atlas(
         DataError: Data that are damaged or another task's.
     """
     from datamodules.relabel import check_widths
-    from datamodules.sources import load_trajectories, resolve_task
+    from datamodules.sources import load_trajectories
 
     tell("looking at the checkpoint")
     subject = find_subject(place, seed)
@@ -117,10 +117,12 @@ def atlas(
         raise UserError(f"{place} does not know its data: give --data, for example local:DIR, minari:ID or d4rl:FILE")
     if name is None:
         raise UserError(f"{place} does not say which task it is for: give --task; `dds tasks` lists them")
-    wanted = resolve_task(spec, get_task(task) if task else known_task(name))
+    known = get_task(task) if task else known_task(name)  # a name from a file never opens another
     models = [SkillModule.load(path) for path in against]
     tell("reading the data")
-    trajectories = load_trajectories(spec, wanted)
+    trajectories = load_trajectories(spec, known)
+    wanted = trajectories.task
+    assert wanted is not None
     for model in (subject.agent.skill, *models):
         check_widths(trajectories, model)
     result, main, singles = _episodes(subject, wanted, episodes, seed, tell)

@@ -41,7 +41,7 @@ def get_task(name: str | Task) -> Task:
     Raises:
         UserError: There is no such task; the message lists the nearest names.
     """
-    if isinstance(name, Task):
+    if not isinstance(name, str):
         return name
     return remember(load_task(name)) if is_address(name) else known_task(name)
 

@@ -110,28 +110,28 @@ SPOILT: dict[str, tuple[Spoil, str]] = {
     "no rewards": (lambda f: f.pop("rewards"), "'rewards' is missing; found actions, infos, observations"),
     "no observations": (lambda f: f.pop("observations"), "'observations' is missing; found actions"),
     "empty": (lambda f: [f.pop(key) for key in list(f)], "'observations' is missing; found nothing"),
-    "Minari's layout": (_minari, "laid out as Minari's files are, one group an episode; read it with local:DIR"),
-    "a group for an array": (_group, "observations: found a group, expected an array"),
-    "flat observations": (replace("observations", np.zeros(660)), r"observations: found shape \(660,\), expected"),
+    "Minari's layout": (_minari, "it has the layout of Minari's files, one group per episode; read it with local:DIR"),
+    "a group for an array": (_group, "observations: got a group, expected an array"),
+    "flat observations": (replace("observations", np.zeros(660)), r"observations: got shape \(660,\), expected"),
     "two-dimensional rewards": (
         replace("rewards", np.zeros((60, 2))),
-        r"rewards: found shape \(60, 2\), expected \(rows,\)",
+        r"rewards: got shape \(60, 2\), expected \(rows,\)",
     ),
-    "one number for an array": (replace("rewards", 1.0), "rewards: found one value, expected an array"),
-    "nothing for an array": (replace("rewards", h5py.Empty("f4")), "rewards: found nothing, expected an array"),
+    "one number for an array": (replace("rewards", 1.0), "rewards: got one value, expected an array"),
+    "nothing for an array": (replace("rewards", h5py.Empty("f4")), "rewards: got nothing, expected an array"),
     "no rows": (
         lambda f: [replace(k, f[k][:0])(f) for k in list(f) if k != "infos"],
-        "rewards: found 0 rows, expected",
+        "rewards: got 0 rows, expected",
     ),
-    "an action too few": (replace("actions", np.zeros((59, 3))), "actions: found 59 rows, but rewards has 60"),
-    "a flag too few": (replace("timeouts", np.zeros(59, bool)), "timeouts: found 59 rows, but rewards has 60"),
+    "an action too few": (replace("actions", np.zeros((59, 3))), "actions: got 59 rows, but rewards has 60"),
+    "a flag too few": (replace("timeouts", np.zeros(59, bool)), "timeouts: got 59 rows, but rewards has 60"),
     "another task's widths": (
         replace("observations", np.zeros((60, 17))),
-        r"observations: found shape \(60, 17\), expected \(rows, 11\) as task 'hopper-medium' has it",
+        r"observations: got shape \(60, 17\), expected \(rows, 11\) as task 'hopper-medium' has it",
     ),
     "next observations of another width": (
         lambda f: f.create_dataset("next_observations", data=np.zeros((60, 10))),
-        r"next_observations: found shape \(60, 10\), expected \(rows, 11\)",
+        r"next_observations: got shape \(60, 10\), expected \(rows, 11\)",
     ),
     "next observations of other rows": (
         lambda f: f.create_dataset("next_observations", data=f["observations"][:]),
@@ -139,36 +139,36 @@ SPOILT: dict[str, tuple[Spoil, str]] = {
     ),
     "not a number": (
         _put("observations", (7, 3), np.nan),
-        "observations: found nan at row 7, column 3, expected finite",
+        "observations: got nan at row 7, column 3, expected finite",
     ),
-    "infinite reward": (_put("rewards", 9, np.inf), "rewards: found inf at row 9, expected finite"),
-    "too large for 32 bits": (replace("rewards", np.full(60, 1e300)), r"rewards: found 1e\+300 at row 0"),
+    "infinite reward": (_put("rewards", 9, np.inf), "rewards: got inf at row 9, expected finite"),
+    "too large for 32 bits": (replace("rewards", np.full(60, 1e300)), r"rewards: got 1e\+300 at row 0"),
     "outside the box": (
         _put("actions", (11, 2), 1.5),
-        "actions: found 1.5 at row 11, column 2, expected -1 to 1",
+        "actions: got 1.5 at row 11, column 2, expected -1 to 1",
     ),
-    "odd flags": (replace("terminals", np.full(60, 0.5)), "terminals: found 0.5 at row 0, expected 0 or 1"),
+    "odd flags": (replace("terminals", np.full(60, 0.5)), "terminals: got 0.5 at row 0, expected 0 or 1"),
     "flags that are no numbers": (
         replace("terminals", np.full(60, np.nan)),
-        "terminals: found nan at row 0, expected 0 or 1",
+        "terminals: got nan at row 0, expected 0 or 1",
     ),
-    "text": (replace("rewards", np.array([b"x"] * 60)), "rewards: found values of type .S1, expected real numbers"),
+    "text": (replace("rewards", np.array([b"x"] * 60)), "rewards: got values of type .S1, expected real numbers"),
     "objects": (
         replace("observations", np.array(["os.system('true')"] * 60, object), dtype=h5py.string_dtype()),
-        "observations: found values of type object, expected real numbers",
+        "observations: got values of type object, expected real numbers",
     ),
     "ragged": (
         declare("actions", (60,), h5py.vlen_dtype(np.float32)),
-        "actions: found values of type object, expected real numbers",
+        "actions: got values of type object, expected real numbers",
     ),
     "compound": (
         replace("rewards", np.zeros(60, [("a", "f4"), ("b", "i4")])),
-        r"rewards: found values of type \[\('a'.*expected real numbers",
+        r"rewards: got values of type \[\('a'.*expected real numbers",
     ),
-    "opaque": (replace("rewards", np.zeros(60, "V8")), "rewards: found values of type .V8, expected real numbers"),
-    "complex": (replace("rewards", np.zeros(60, complex)), "rewards: found values of type complex128, expected"),
-    "arrays in arrays": (declare("rewards", (60,), np.dtype("(2,)f4")), "rewards: found values of type .*expected"),
-    "references": (_references, "actions: found values of type object, expected real numbers"),
+    "opaque": (replace("rewards", np.zeros(60, "V8")), "rewards: got values of type .V8, expected real numbers"),
+    "complex": (replace("rewards", np.zeros(60, complex)), "rewards: got values of type complex128, expected"),
+    "arrays in arrays": (declare("rewards", (60,), np.dtype("(2,)f4")), "rewards: got values of type .*expected"),
+    "references": (_references, "actions: got values of type object, expected real numbers"),
     "a soft link": (replace("rewards", h5py.SoftLink("/infos/qpos")), "'rewards' is a link to elsewhere"),
     "a link to another file": (
         replace("rewards", h5py.ExternalLink("elsewhere.hdf5", "/rewards")),
@@ -196,7 +196,7 @@ SPOILT: dict[str, tuple[Spoil, str]] = {
     "no ends": (_no_ends, "terminals: none of the 60 rows is marked as an episode's last, .* no complete episode"),
     "nothing but ends": (
         lambda f: (_put("timeouts", slice(None), True)(f), _put("terminals", slice(None), False)(f)),
-        "observations: no row leads to another one, so it holds no complete episode",
+        "observations: no row leads to another one, so it has no complete episode",
     ),
 }
 
@@ -237,7 +237,7 @@ def test_a_truncated_file_is_refused(keep: float, tmp_path: Path) -> None:
 def test_what_is_no_hdf5_is_refused(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "page.hdf5"
     path.write_bytes(content)
-    with pytest.raises(DataError, match=r"page.hdf5 is truncated or damaged, or no HDF5 file at all"):
+    with pytest.raises(DataError, match=r"page.hdf5 is truncated or damaged, or not an HDF5 file at all"):
         load_trajectories(f"d4rl:{path}", HOPPER)
 
 
@@ -267,11 +267,11 @@ def test_random_changes_of_bytes_load_or_are_refused_in_a_sentence(tmp_path: Pat
 
 OTHERS = {
     "another maze": ("antmaze-large-play", "antmaze-umaze", "of the positions lie outside the corridors of task"),
-    "another physics": ("antmaze-umaze@robotics", "antmaze-umaze", "of another physics with other coordinates"),
+    "another physics": ("antmaze-umaze@robotics", "antmaze-umaze", "of other physics with other coordinates"),
     "another body of the same widths": ("halfcheetah-medium", "walker2d-medium", "median height is .* another body"),
     "the other way round": ("walker2d-medium", "halfcheetah-medium", "median height is .* another body"),
     "other subtasks": ("kitchen-mixed", "kitchen-partial", "column 41, but the goal of task 'kitchen-partial'"),
-    "other widths": ("kitchen-mixed", "antmaze-umaze", r"found shape \(60, 60\), expected \(rows, 29\) as task"),
+    "other widths": ("kitchen-mixed", "antmaze-umaze", r"got shape \(60, 60\), expected \(rows, 29\) as task"),
 }
 
 

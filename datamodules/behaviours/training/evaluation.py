@@ -178,14 +178,14 @@ def score_navigator(noises: tuple[float, ...], *, episodes: int = 100, seed: int
         reached the goal), `cap` (steps after which an episode is over).
     """
     from datamodules.collect.antmaze import AntMazeRecipe, AntNavigator
-    from dds_lightning.rollout.actors import Contestant, EveryRow
+    from dds_lightning.rollout.actors import Contestant
     from dds_lightning.rollout.play import rollout
 
     rows = []
     for maze in ("umaze", "medium", "large"):
         task = get_task("antmaze-umaze" if maze == "umaze" else f"antmaze-{maze}-diverse")
         players = [
-            Contestant(f"{noise:g}", EveryRow(AntNavigator(task, AntMazeRecipe(action_noise=noise))), episodes)
+            Contestant(f"{noise:g}", AntNavigator(task, AntMazeRecipe(action_noise=noise)), episodes)
             for noise in noises
         ]
         played = rollout(task, players, seed=seed).episodes
