@@ -125,9 +125,7 @@ def _limits(task: Task) -> str:
 def _provenance(source: str, task: Task) -> str:
     """Return where the data came from, and what the scores may be compared with."""
     if source.startswith("collected"):
-        return (
-            "The data come from this project's controllers: scores are not comparable with those on D4RL's own data."
-        )
+        return "The data come from this project's controllers: scores are not comparable with those on D4RL's own data."
     if source.startswith("d4rl:"):
         return (
             f"The data are a file in D4RL's layout ({source}): compare scores only with others on that same file, and "
