@@ -66,8 +66,8 @@ def test_every_module_imports():
                 continue  # a script, which runs when it is imported
             try:
                 importlib.import_module(module.name)
-            except UserError as error:
-                if "pip install 'dds-lightning[" not in str(error):  # an extra that is not installed
+            except (ModuleNotFoundError, UserError) as error:
+                if "stable-baselines3" not in str(error).replace("_", "-"):  # of the extra `behaviours`
                     raise
 
 
