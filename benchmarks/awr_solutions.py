@@ -1,10 +1,10 @@
-"""AWR by regression against AWR in closed form, on the same critic: which policy comes out, and how far it gets.
+"""AWR by regression against AWR in closed form, on the same critic: which policy results, and how well it does.
 
     python benchmarks/awr_solutions.py runs/antmaze-large-diverse --alphas 3 10 30 --episodes 20
 
-Takes a finished `dds run`, keeps its skills, its transitions and its critic, and learns only the actor anew: by
-regression with weights exp(alpha A), clipped at 100 and at 1000, and, once for all alphas, as the policy of the data
-that the closed form multiplies with exp(alpha A). Then all play the same episodes, greedy and sampled.
+Takes a finished `dds run`, keeps its skills, transitions and critic, and trains only the actor again: by regression
+with weights exp(alpha A), clipped at 100 and at 1000, and, once for all alphas, as the policy of the data that the
+closed form multiplies by exp(alpha A). Then all policies play the same episodes, greedy and sampled.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from dds_lightning.study.findings import Findings
 
 
 def learn_actor(policy: PolicyModule, features: Tensor, codes: Tensor, weights: Tensor, steps: int) -> float:
-    """Fit the policy's actor to codes (N,) at features (N, F) with weights (N,); returns the last 100 losses' mean."""
+    """Fit the policy's actor to codes (N,) at features (N, F) with weights (N,); return the mean of the last 100."""
     torch.manual_seed(0)
     for layer in policy.actor:
         if isinstance(layer, torch.nn.Linear):
@@ -48,14 +48,14 @@ def learn_actor(policy: PolicyModule, features: Tensor, codes: Tensor, weights: 
 
 
 def solutions(policy: PolicyModule, table: Relabelled, alphas: list[float], steps: int) -> dict[str, PolicyModule]:
-    """Policies on one critic by name: regression with two clips, and the closed form, for each alpha."""
+    """Policies on one critic, by name: for each alpha, regression with two clips and the closed form."""
     with torch.no_grad():
         features = torch.cat([policy.embed(part) for part in table.observations.split(20_000)])
         q = torch.cat([policy.q(part) for part in table.observations.split(20_000)])
         v = torch.cat([policy.v(part) for part in table.observations.split(20_000)])
     codes = table.codes.long()
     advantages = q.gather(-1, codes[:, None]).squeeze(-1) - v
-    found = {}
+    policies = {}
     data = copy.deepcopy(policy)
     data.hparams.awr = "closed_form"
     learn_actor(data, features, codes, torch.ones_like(advantages), steps)
@@ -65,34 +65,34 @@ def solutions(policy: PolicyModule, table: Relabelled, alphas: list[float], step
             regressed = copy.deepcopy(policy)
             regressed.hparams.awr = "regression"
             learn_actor(regressed, features, codes, weights, steps)
-            size = 100 * losses.effective_sample_size(weights).item()
-            found[f"regression, alpha {alpha:g}, clip {clip:g} ({size:.0f} % of the samples count)"] = regressed
+            share = 100 * losses.effective_sample_size(weights).item()
+            policies[f"regression, alpha {alpha:g}, clip {clip:g} ({share:.0f} % of the samples count)"] = regressed
         exact = copy.deepcopy(data)
         exact.hparams.alpha = alpha
-        found[f"closed form, alpha {alpha:g}"] = exact
-    return found
+        policies[f"closed form, alpha {alpha:g}"] = exact
+    return policies
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--alphas", type=float, nargs="+", default=[3.0, 10.0, 30.0])
-    parser.add_argument("--steps", type=int, default=8000, help="of each actor")
+    parser.add_argument("--steps", type=int, default=8000, help="training steps of each actor")
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--seed", type=int, default=100)
-    parser.add_argument("--out", type=Path, help="write the table there as CSV")
+    parser.add_argument("--out", type=Path, help="also write the table to this CSV file")
     arguments = parser.parse_args()
     files = sorted((arguments.run / "relabel").glob("*.safetensors"))
     if not files:
-        parser.exit(2, f"{arguments.run} holds no relabelled data: finish `dds run` there first\n")
+        parser.exit(2, f"{arguments.run} has no relabelled data: finish `dds run` there first\n")
     task = Findings.read(arguments.run).task
     skill = SkillModule.load(arguments.run / "skill/last.ckpt")
     policy = PolicyModule.load(arguments.run / "policy/last.ckpt")
-    found = solutions(policy, Relabelled.load(files[-1]), arguments.alphas, arguments.steps)
+    policies = solutions(policy, Relabelled.load(files[-1]), arguments.alphas, arguments.steps)
     contestants = [
         Contestant(f"{name}, {selection}", DDSAgent(skill, one, selection), arguments.episodes)
-        for name, one in found.items()
+        for name, one in policies.items()
         for selection in ("greedy", "sample")
     ]
     summary: pd.DataFrame = rollout(task, contestants, seed=arguments.seed).summary()

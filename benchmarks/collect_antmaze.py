@@ -1,9 +1,9 @@
-"""What collecting AntMaze data costs beside the bare simulator.
+"""The cost of collecting AntMaze data, compared with the simulator alone.
 
     python benchmarks/collect_antmaze.py [--task antmaze-medium-diverse] [--steps 16000] [--rounds 3]
 
-In turns, on one core and in one process: the collector (planner, controller, noise, recording) and the same
-environment driven by uniform random actions. Prints steps a processor second of both and their ratio, round by round.
+Alternates, on one core and in one process, between the collector (planner, controller, noise, recording) and the same
+environment driven by uniform random actions. Prints steps per processor second of both and their ratio for each round.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", default="antmaze-medium-diverse")
     parser.add_argument("--steps", type=int, default=16_000)

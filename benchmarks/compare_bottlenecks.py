@@ -1,13 +1,13 @@
-"""Discrete against continuous skills: the same data, steps and sizes, several seeds, the same measurements.
+"""Discrete against continuous skills: same data, steps, sizes, seeds and measurements.
 
     python benchmarks/compare_bottlenecks.py [--task pointmaze-large-diverse] [--data local:DIR] [--skills 4]
         [--seeds 3] [--steps 2500] [--out runs/bottlenecks]
 
-For each seed trains a codebook of K skills and a Gaussian bottleneck of as many dimensions, puts the continuous skills
-into K clusters, and measures both alike on the episodes that the training left out. Prints means over seeds with their
-standard deviations, and leaves `models-K.csv` (a row a model), `table-K.csv` and `comparison-K.png` in --out. Without
---data 200,000 steps are collected there first. A training takes about three minutes of one core; those that are done
-are found done, and one that was stopped goes on.
+For each seed, trains a codebook of K skills and a Gaussian bottleneck with as many dimensions, groups the continuous
+skills into K clusters, and measures both in the same way on the episodes that the training left out. Prints means over
+seeds with standard deviations, and writes `models-K.csv` (one row per model), `table-K.csv` and `comparison-K.png` to
+--out. Without --data, 200,000 steps are collected there first. A training takes about three minutes on one core;
+finished trainings are reused, and an interrupted one is resumed.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from dds_lightning.saving.run_directory import Done, Stages
 from dds_lightning.tasks import Task, get_task
 
 DIM = 64
-"""D, of codes and of continuous skills."""
+"""Dimension D of codes and of continuous skills."""
 PRECISION = "bf16-mixed"
-"""Of training; half again as fast as float32 on a processor with matrix units."""
+"""Precision of training: 1.5 times as fast as float32 on a processor with matrix units."""
 STATES = 64
-"""From which every code is replayed, and segments of each code's round trip."""
+"""Number of states from which every code is replayed, and of segments in each code's round trip."""
 MEASURES = (
     ("own_accuracy", "found again in own states, %", 100.0),
     ("own_control", "  the same, another code held, %", 100.0),
@@ -42,13 +42,13 @@ MEASURES = (
     ("decoded", "error of decoded actions under codes", 1.0),
     ("decoded_own", "  under each segment's own vector", 1.0),
 )
-"""Columns of `compare_recovery`, what the table calls them, and a factor."""
+"""Columns of `compare_recovery`, their names in the table, and a factor."""
 
 
-def data_of(stages: Stages, task: Task, given: str | None) -> tuple[str, list[Done]]:
-    """The data that were given, or collected data, as SOURCE:NAME."""
-    if given is not None:
-        return given, []
+def data_of(stages: Stages, task: Task, data: str | None) -> tuple[str, list[Done]]:
+    """The given data, or newly collected data, as SOURCE:NAME."""
+    if data is not None:
+        return data, []
 
     def work(folder: Path, resuming: bool) -> dict[str, Any]:
         from datamodules.collect.collectors import collect
@@ -59,27 +59,27 @@ def data_of(stages: Stages, task: Task, given: str | None) -> tuple[str, list[Do
     return f"local:{done.outputs['data']}", [done]
 
 
-def train(stages: Stages, name: str, task: Task, spec: str, reads: list[Done], own: list[str], steps: int) -> Path:
-    """The checkpoint of one model; trained unless it was before."""
+def train(stages: Stages, name: str, task: Task, spec: str, reads: list[Done], settings: list[str], steps: int) -> Path:
+    """Train one model, unless that is already done; return its checkpoint."""
     from dds_lightning.training.stage_cli import StageCLI, quieten
 
     quieten()
-    words = [*own, f"--data.task={task.name}", f"--data.data={spec}", f"--model.skill_dim={DIM}"]
-    words += [f"--trainer.max_steps={steps}", f"--trainer.precision={PRECISION}"]
+    args = [*settings, f"--data.task={task.name}", f"--data.data={spec}", f"--model.skill_dim={DIM}"]
+    args += [f"--trainer.max_steps={steps}", f"--trainer.precision={PRECISION}"]
 
     def work(folder: Path, resuming: bool) -> dict[str, Any]:
-        places = [f"--checkpoint.dirpath={folder}", f"--trainer.default_root_dir={folder}"]
-        kept = folder / "last.ckpt"
-        again = [f"--ckpt_path={kept}"] if resuming and kept.is_file() else []
-        fit = ["fit", "--config", f"{task.family}/skill.yaml", *words, *places, "--trainer.enable_model_summary=false"]
-        return {"checkpoint": Path(StageCLI("skill", [*fit, *again]).execute().data["checkpoint"])}
+        folders = [f"--checkpoint.dirpath={folder}", f"--trainer.default_root_dir={folder}"]
+        last = folder / "last.ckpt"
+        resume = [f"--ckpt_path={last}"] if resuming and last.is_file() else []
+        fit = ["fit", "--config", f"{task.family}/skill.yaml", *args, *folders, "--trainer.enable_model_summary=false"]
+        return {"checkpoint": Path(StageCLI("skill", [*fit, *resume]).execute().data["checkpoint"])}
 
-    done = stages.do(name, f"{name}: {steps:,} steps", {"words": sorted(words)}, reads, work)
+    done = stages.do(name, f"{name}: {steps:,} steps", {"words": sorted(args)}, reads, work)
     return done.outputs["checkpoint"]
 
 
 def measure(task: Task, spec: str, seed: int, skills: int, checkpoints: dict[str, Path], console: Console) -> Any:
-    """Both models of a seed on the episodes that neither was trained on; a row each."""
+    """Measure both models of a seed on the episodes that neither was trained on; one row per model."""
     from datamodules import SegmentDataModule
     from dds_lightning.interpret.measure.comparison import compare_recovery
     from dds_lightning.skill import SkillModule
@@ -88,57 +88,57 @@ def measure(task: Task, spec: str, seed: int, skills: int, checkpoints: dict[str
     data = SegmentDataModule(task.name, spec, seed=seed)
     data.setup()
     held_out = data.trajectories.select(data.validation_episodes)
-    made = compare_recovery(
+    table = compare_recovery(
         task, held_out, models, skills, STATES, seed, lambda name: console.print(f"measuring seed {seed}: {name}")
     )
-    return made.assign(seed=seed)
+    return table.assign(seed=seed)
 
 
 def summary(models: pd.DataFrame) -> pd.DataFrame:
-    """A row a measure, a column a kind: mean over seeds, and standard deviation where there are several."""
+    """One row per measure, one column per kind: mean over seeds, and standard deviation if there are several."""
     rows = []
-    for column, words, factor in MEASURES:
-        row = {"measure": words}
-        for name, part in models.groupby("model", sort=False):
+    for column, name, factor in MEASURES:
+        row = {"measure": name}
+        for model, part in models.groupby("model", sort=False):
             values = factor * part[column].dropna()
             spread = f" ± {values.std(ddof=1):.3g}" if len(values) > 1 else ""
-            row[str(name)] = f"{values.mean():.3g}{spread}" if len(values) else "–"
+            row[str(model)] = f"{values.mean():.3g}{spread}" if len(values) else "–"
         rows.append(row)
     return pd.DataFrame(rows)
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", default="pointmaze-large-diverse")
-    parser.add_argument("--data", help="SOURCE:NAME; without it data are collected")
+    parser.add_argument("--data", help="SOURCE:NAME (default: collect data)")
     parser.add_argument("--skills", type=int, default=4, help="K")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--steps", type=int, default=2500)
     parser.add_argument("--out", type=Path, default=Path("runs/bottlenecks"))
-    wanted = parser.parse_args()
-    task, console = get_task(wanted.task), Console(stderr=True)
-    stages = Stages(wanted.out, console)
-    spec, reads = data_of(stages, task, wanted.data)
+    arguments = parser.parse_args()
+    task, console = get_task(arguments.task), Console(stderr=True)
+    stages = Stages(arguments.out, console)
+    spec, reads = data_of(stages, task, arguments.data)
     parts = []
-    for seed in range(wanted.seeds):
+    for seed in range(arguments.seeds):
         seeds = [f"--seed_everything={seed}", f"--data.seed={seed}"]
         kinds = {
-            DISCRETE: (f"vq{wanted.skills}", ["--model.bottleneck=vq", f"--model.num_skills={wanted.skills}"]),
+            DISCRETE: (f"vq{arguments.skills}", ["--model.bottleneck=vq", f"--model.num_skills={arguments.skills}"]),
             CONTINUOUS: ("gaussian", ["--model.bottleneck=gaussian"]),
         }
         checkpoints = {
-            kind: train(stages, f"{name}-seed{seed}", task, spec, reads, [*seeds, *words], wanted.steps)
-            for kind, (name, words) in kinds.items()
+            kind: train(stages, f"{name}-seed{seed}", task, spec, reads, [*seeds, *settings], arguments.steps)
+            for kind, (name, settings) in kinds.items()
         }
-        parts.append(measure(task, spec, seed, wanted.skills, checkpoints, console))
+        parts.append(measure(task, spec, seed, arguments.skills, checkpoints, console))
     models = pd.concat(parts, ignore_index=True)
     table = summary(models)
-    models.to_csv(wanted.out / f"models-{wanted.skills}.csv", index=False)
-    table.to_csv(wanted.out / f"table-{wanted.skills}.csv", index=False)
-    title = f"{task.name}: K = {wanted.skills}, D = {DIM}, {wanted.steps:,} steps, {wanted.seeds} seeds"
+    models.to_csv(arguments.out / f"models-{arguments.skills}.csv", index=False)
+    table.to_csv(arguments.out / f"table-{arguments.skills}.csv", index=False)
+    title = f"{task.name}: K = {arguments.skills}, D = {DIM}, {arguments.steps:,} steps, {arguments.seeds} seeds"
     Console().print(text_table(table, title))
-    path = wanted.out / f"comparison-{wanted.skills}.png"
+    path = arguments.out / f"comparison-{arguments.skills}.png"
     path.write_bytes(small_png(png_bytes(plot_comparison(models))))
     print(path)
 

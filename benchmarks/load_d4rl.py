@@ -1,10 +1,10 @@
-"""How long, and in how much memory, a D4RL file of a million AntMaze steps loads.
+"""The time and memory that loading a D4RL file of a million AntMaze steps takes.
 
     python benchmarks/load_d4rl.py [--rows 1000000] [--file FILE]
 
-makes a file of that size in D4RL's layout (the numbers are invented; widths, types and compression are D4RL's),
-loads it in a fresh process, and prints seconds and the peak of resident memory, imports included. With --file, that
-file is loaded, and made first if it is not there.
+Makes a file of that size in D4RL's layout (the numbers are invented; widths, types and compression are D4RL's),
+loads it in a new process, and prints seconds and peak resident memory, including imports. With --file, that file is
+loaded; it is made first if it does not exist.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from pathlib import Path
 
 TASK = "antmaze-medium-play"
 EPISODE = 1001
-"""Rows of a recording, as D4RL cut them."""
+"""Rows per recording, as D4RL cut them."""
 
 
 def make_file(path: Path, rows: int) -> None:
-    """Write `rows` rows: recordings that pace the first corridor, some of which stand on a goal there."""
+    """Write `rows` rows: recordings that pace up and down the first corridor, some reaching a goal there."""
     import h5py
     import numpy as np
 
@@ -51,7 +51,7 @@ def make_file(path: Path, rows: int) -> None:
 
 
 def measure(path: Path) -> None:
-    """Load a file in this process, which has done nothing else, and print what it took."""
+    """Load a file in this process, which has done nothing else, and print time and memory."""
     started = time.perf_counter()
     from datamodules import load_trajectories
 
@@ -64,21 +64,21 @@ def measure(path: Path) -> None:
 
 
 def main() -> None:
-    """Parse the command line and run."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--rows", type=int, default=1_000_000)
     parser.add_argument("--file", type=Path)
     parser.add_argument("--measure", action="store_true", help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.measure:
-        return measure(options.file)
+    arguments = parser.parse_args()
+    if arguments.measure:
+        return measure(arguments.file)
     with tempfile.TemporaryDirectory() as folder:
-        path = options.file or Path(folder) / "antmaze.hdf5"
+        path = arguments.file or Path(folder) / "antmaze.hdf5"
         if not path.is_file():
-            make_file(path, options.rows)
+            make_file(path, arguments.rows)
         print(f"{path.stat().st_size / 1e6:.0f} MB on disk", flush=True)
-        again = [sys.executable, os.path.abspath(__file__), "--measure", "--file", str(path)]
-        subprocess.run(again, check=True)  # noqa: S603 - this very file, no shell
+        command = [sys.executable, os.path.abspath(__file__), "--measure", "--file", str(path)]
+        subprocess.run(command, check=True)  # noqa: S603 - this very file, no shell
     return None
 
 

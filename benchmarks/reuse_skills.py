@@ -1,18 +1,19 @@
-"""Skills learnt in PointMaze-Medium, reused in PointMaze-Large, against skills learnt there from nothing.
+"""Skills learnt in PointMaze-Medium and reused in PointMaze-Large, against skills learnt there from scratch.
 
     python benchmarks/reuse_skills.py [--seeds 3] [--out runs/reuse_skills] [--threads 1] [--figures DIR] [--quick]
 
-For each seed, on data collected on the spot: skills are learnt in Medium; that is paid before. Then Large, in four
-ways that differ only in where the skills come from; the policy always learns anew, because the maze is new:
+For each seed, on data collected for the purpose, skills are learnt in Medium; that cost is paid in advance. Large
+follows in four ways that differ only in where the skills come from; the policy is always trained from scratch, because
+the maze is new:
 
 - nothing: 1,000 steps of skill training, as many as in Medium;
 - nothing, in short: the same with 240 steps, as many as the fine-tuning gets;
 - reused as they are: no step;
-- reused, decoder fine-tuned: 240 steps; encoder and codebook stay, bit for bit.
+- reused, decoder fine-tuned: 240 steps; encoder and codebook stay the same to the bit.
 
-The agent plays at intervals while the policy learns. Steps count skill training in Large and policy; seconds are
-those of the processor for the two trainings and the relabelling between, without evaluations, so that a busy
-machine tells the same. A call that was stopped goes on when it is made again.
+The agent plays at intervals while the policy learns. Steps count skill training in Large and policy training; seconds
+are processor seconds of the two trainings and the relabelling in between, without evaluations, so that a busy machine
+gives the same numbers. An interrupted call continues when it is repeated.
 
 Writes `skills-reused.csv` and `skills-reused.png` into --figures and prints a table.
 """
@@ -53,7 +54,7 @@ POLICY = {
 
 @dataclass(frozen=True)
 class Way:
-    """Where the skills in Large come from: steps of their training there, what of Medium's model learns, colour."""
+    """Where the skills in Large come from: steps of training there, trained parts of Medium's model, and a colour."""
 
     name: str
     steps: int
@@ -70,48 +71,48 @@ WAYS = (
 
 
 class Curve(Callback):
-    """What each validation found, after how many steps and seconds of the processor in training steps."""
+    """The results of each validation, with the steps and the processor seconds of training steps so far."""
 
     def __init__(self) -> None:
         self.rows: list[dict[str, float]] = []
         self.seconds = self.begun = 0.0
 
     def on_train_batch_start(self, *args: Any) -> None:
-        """A step begins."""
+        """Start the clock."""
         self.begun = time.process_time()
 
     def on_train_batch_end(self, *args: Any) -> None:
-        """A step has ended."""
+        """Stop the clock."""
         self.seconds += time.process_time() - self.begun
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Note the results; `RolloutEvaluation` has played before."""
-        found = trainer.callback_metrics
-        wanted = {"rmse": "val/reconstruction_rmse", "success": "rollout/success"}
-        row = {name: float(found[key]) for name, key in wanted.items() if key in found}
+        """Record the results; `RolloutEvaluation` has played already."""
+        logged = trainer.callback_metrics
+        names = {"rmse": "val/reconstruction_rmse", "success": "rollout/success"}
+        row = {name: float(logged[key]) for name, key in names.items() if key in logged}
         self.rows.append({"step": float(trainer.global_step), "seconds": self.seconds, **row})
 
     def state_dict(self) -> dict[str, Any]:
-        """For a training that goes on."""
+        """The curve so far, for a training that is resumed."""
         return {"rows": list(self.rows), "seconds": self.seconds}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on from `state_dict`."""
+        """Continue from `state_dict`."""
         self.rows, self.seconds = list(state_dict["rows"]), state_dict["seconds"]
 
 
 class Study:
-    """One seed's folder and what was asked for."""
+    """The trainings of one seed, in one folder."""
 
     def __init__(self, out: Path, seed: int, quick: bool) -> None:
         self.root, self.seed, self.quick = out / f"seed{seed}", seed, quick
 
     def steps(self, steps: int) -> int:
-        """So many steps, or a fiftieth of them in a quick run."""
+        """That many steps, or a fiftieth of them in a quick run."""
         return max(steps // 50, 4) if self.quick and steps else steps
 
     def data(self, task: str) -> str:
-        """Collect once."""
+        """Collect the data of a task, unless that is done; return SOURCE:NAME."""
         folder = self.root / "data" / task
         if not folder.is_dir():
             collect_pointmaze(task, self.steps(DATA_STEPS[task]), self.seed, folder.parent, 1, dataset_id=task)
@@ -120,21 +121,21 @@ class Study:
     def fit(
         self, name: str, module: pl.LightningModule, data: pl.LightningDataModule, steps: int, *callbacks: Callback
     ) -> tuple[Path, pd.DataFrame]:
-        """Train, or go on, or find it done: the checkpoint and the curve."""
+        """Train, resume or reuse a finished training; return its checkpoint and its curve."""
         folder, curve = self.root / name, Curve()
         last, table = folder / "last.ckpt", folder / "curve.csv"
         if not table.is_file():
             print(f"seed {self.seed}: {name}", flush=True)
-            wanted: dict[str, Any] = {
+            settings: dict[str, Any] = {
                 "default_root_dir": str(folder), "max_steps": steps, "max_epochs": -1, "accelerator": "cpu",
                 "devices": 1, "check_val_every_n_epoch": None, "num_sanity_val_steps": 0, "limit_val_batches": 8,
                 "val_check_interval": max(steps // 8, 1), "logger": False,
                 "enable_progress_bar": False, "enable_model_summary": False,
                 "callbacks": [*callbacks, curve],
             }  # fmt: skip
-            trainer = pl.Trainer(**trainer_settings(wanted, [RollingCheckpoint(str(folder))]))
+            trainer = pl.Trainer(**trainer_settings(settings, [RollingCheckpoint(str(folder))]))
             if getattr(module, "init_from", None) and not last.is_file():
-                trainer.validate(module, data, verbose=False)  # what was brought, before the first step
+                trainer.validate(module, data, verbose=False)  # the skills as loaded, before the first step
             trainer.fit(module, data, ckpt_path=last if last.is_file() else None, weights_only=True)
             pd.DataFrame(curve.rows).to_csv(table, index=False)
         return last, pd.read_csv(table)
@@ -147,7 +148,7 @@ class Study:
         return self.fit(name, model, data, self.steps(steps))
 
     def policy(self, name: str, skill: Path) -> tuple[float, pd.DataFrame]:
-        """Relabel Large and train a policy that plays as it learns: seconds of relabelling, and the curve."""
+        """Relabel Large and train a policy that plays as it learns; return the seconds of relabelling and the curve."""
         data = RelabeledDataModule(LARGE, self.data(LARGE), str(skill), cache=str(self.root / name), seed=self.seed)
         begun, marker = time.process_time(), self.root / name / "relabelling.txt"
         data.prepare_data()
@@ -160,7 +161,7 @@ class Study:
         return float(marker.read_text()), self.fit(name, policy, data, self.steps(4000), playing)[1]
 
     def table(self) -> pd.DataFrame:
-        """One row a measurement: way, stage, step and seconds in Large so far, and what was measured."""
+        """One row per measurement: way, stage, steps and seconds in Large so far, and the results."""
         medium, curve = self.skills("medium-skill", MEDIUM, 1000)
         tables = [curve.assign(way="Medium, paid before", stage="skill")]
         for way in WAYS:
@@ -181,14 +182,14 @@ class Study:
 
 
 def plot(table: pd.DataFrame) -> Figure:
-    """Success over steps and over seconds, and the decoder's error while skills learn: means, and all seeds' range."""
+    """Plot success over steps and seconds, and the decoder's error over skill training: mean and range over seeds."""
     figure = Figure(figsize=(9.5, 3.6), layout="constrained")
     panels = figure.subplots(1, 3)
     for way in WAYS:
-        own = table[table["way"] == way.name]
-        _band(panels[0], own[own["stage"] == "policy"], "step", "success", way)
-        _band(panels[1], own[own["stage"] == "policy"], "seconds", "success", way)
-        _band(panels[2], own[own["stage"] == "skill"], "step", "rmse", way)
+        part = table[table["way"] == way.name]
+        _band(panels[0], part[part["stage"] == "policy"], "step", "success", way)
+        _band(panels[1], part[part["stage"] == "policy"], "seconds", "success", way)
+        _band(panels[2], part[part["stage"] == "skill"], "step", "rmse", way)
     panels[0].set(xlabel="steps in Large, skills and policy", ylabel="success in Large, %")
     panels[1].set(xlabel="seconds of one core in Large")
     panels[2].set(xlabel="steps of skill training in Large", ylabel="error of decoded actions (RMSE)")
@@ -209,12 +210,12 @@ def _band(ax: Axes, rows: pd.DataFrame, over: str, what: str, way: Way) -> None:
 
 
 def summary(table: pd.DataFrame) -> pd.DataFrame:
-    """One row a way: mean and standard deviation over the seeds at the end, and when three quarters succeed."""
+    """One row per way: mean and standard deviation over seeds at the end, and when three quarters succeed."""
     rows = []
     for way in WAYS:
-        own = table[(table["way"] == way.name) & (table["stage"] == "policy")]
-        last = own.groupby("seed").last()
-        arrived = own[own["success"] >= 75].groupby("seed").first().reindex(last.index)
+        part = table[(table["way"] == way.name) & (table["stage"] == "policy")]
+        last = part.groupby("seed").last()
+        arrived = part[part["success"] >= 75].groupby("seed").first().reindex(last.index)
         rows.append(
             {
                 "skills in Large": way.name,
@@ -230,21 +231,21 @@ def summary(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--out", type=Path, default=Path("runs/reuse_skills"))
-    parser.add_argument("--figures", type=Path, help="default: the folder of --out")
+    parser.add_argument("--figures", type=Path, help="default: --out")
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--quick", action="store_true", help="a fiftieth of all steps: meaningless, but it runs")
-    options = parser.parse_args()
-    torch.set_num_threads(options.threads)
+    parser.add_argument("--quick", action="store_true", help="a fiftieth of all steps, to check that it runs")
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
     quieten()
-    figures = options.figures or options.out
+    figures = arguments.figures or arguments.out
     figures.mkdir(parents=True, exist_ok=True)
     table = pd.DataFrame()
-    for seed in range(options.seeds):
-        table = pd.concat([table, Study(options.out, seed, options.quick).table()])
+    for seed in range(arguments.seeds):
+        table = pd.concat([table, Study(arguments.out, seed, arguments.quick).table()])
         columns = ["seed", "way", "stage", "step", "seconds", "success", "rmse"]
         table[columns].round({"seconds": 1, "success": 1, "rmse": 4}).to_csv(figures / "skills-reused.csv", index=False)
         plot(table).savefig(figures / "skills-reused.png", dpi=110)

@@ -1,9 +1,9 @@
-"""What an optimiser step of the skill model costs in float32 and in bfloat16, on this machine's processor.
+"""The cost of an optimiser step of the skill model in float32 and in bfloat16, on this machine's processor.
 
     python benchmarks/skill_precision.py [--hidden 192] [--batch 64] [--steps 10] [--rounds 3] [--threads 1]
 
-Random segments of AntMaze's widths; the two precisions in turns, processor milliseconds a step (median).
-Processors with AMX or native bfloat16 products gain; others lose, because they imitate them.
+Uses random segments with AntMaze's widths, alternates between the two precisions, and prints the median processor
+milliseconds per step. Processors with AMX or native bfloat16 products gain; others emulate them and lose.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ OBSERVATIONS, ACTIONS, HORIZON = 29, 8, 10
 
 
 def main() -> None:
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--hidden", type=int, default=192)
     parser.add_argument("--batch", type=int, default=64)
@@ -63,7 +63,7 @@ def main() -> None:
             step(reduced)
             measured[name] = statistics.median(step(reduced) for _ in range(arguments.steps))
         ratio = measured["float32"] / measured["bfloat16"]
-        print(f"float32 {measured['float32']:.1f} ms, bfloat16 {measured['bfloat16']:.1f} ms a step: {ratio:.2f} x")
+        print(f"float32 {measured['float32']:.1f} ms, bfloat16 {measured['bfloat16']:.1f} ms per step: {ratio:.2f} x")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """The data: trajectories, where they come from, and the batches that training reads.
 
-Importing this package is cheap: nothing heavy is loaded before its name is used, so that the processes which
+Importing this package is cheap: nothing heavy is loaded before its name is used, so that the processes that
 collect data never import a deep-learning library.
 """
 

@@ -1,4 +1,4 @@
-"""Looking at data sets: what `dds data check` and `show` print."""
+"""Describes data sets; what `dds data check` and `dds data show` print."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from numpy.typing import NDArray
 from datamodules.sources import load_trajectories
 from datamodules.sources.subtasks import subtasks_completed
 from datamodules.trajectories import Trajectories
-from dds_lightning.tasks import Task, get_task
-from dds_lightning.tasks.columns import action_names, observation_names
+from dds_lightning.tasks import Task
+from dds_lightning.tasks.bodies import action_names, observation_names
 
 BLOCK = 65_536
-"""Rows that are looked at together: a data set of a million steps is never copied as a whole."""
+"""Rows that are processed together, so that a data set of a million steps is never copied as a whole."""
 
 
 def check_dataset(spec: str, task: Task | str | None = None, *, horizon: int | None = None) -> dict[str, Any]:
-    """Read a data set from end to end, refuse it if anything is wrong, else say what is in it.
+    """Read a data set from end to end and describe it; raise an error if anything is wrong.
 
     Args:
         spec: As in `load_trajectories`.
-        task: The task that it must fit, if any; in mazes rewards are then those of the task's goal.
+        task: The task that it must fit, if any; in mazes, rewards are then those of the task's goal.
         horizon: H; if given, also count segments, and refuse data whose episodes are all shorter.
 
     Returns:
@@ -33,24 +33,24 @@ def check_dataset(spec: str, task: Task | str | None = None, *, horizon: int | N
     Raises:
         DataError: At the first thing wrong; the message names data set, episode, field and value.
     """
-    task = get_task(task) if isinstance(task, str) else task
-    return describe(load_trajectories(spec, task), task=task, horizon=horizon)[0]
+    trajectories = load_trajectories(spec, task)
+    return describe(trajectories, task=trajectories.task, horizon=horizon)[0]
 
 
 def describe(
     trajectories: Trajectories, *, task: Task | None = None, horizon: int | None = None
 ) -> tuple[dict[str, Any], pd.DataFrame]:
-    """What a person wants to know of a data set.
+    """Summarise a data set.
 
     Args:
         trajectories: The data.
         task: Adds normalised scores, names of the dimensions and, in mazes, how many of the free cells were
             visited.
-        horizon: Adds the number of segments of that many steps.
+        horizon: Adds the number of segments with that many steps.
 
     Returns:
-        Facts by name, and a table with one row a column of the observations and actions: `dimension`, `name`
-        (of the task's number, "" without a task), `lowest`, `mean`, `std`, `highest`.
+        Facts by name, and a table with one row per column of the observations and actions: `dimension`, `name`
+        (from the task, "" without one), `lowest`, `mean`, `std`, `highest`.
     """
     lengths, returns = trajectories.lengths, trajectories.returns
     terminated = trajectories.terminations[trajectories.step_offsets[1:] - 1]
@@ -71,7 +71,7 @@ def describe(
     }
     if task is not None:
         scored = returns
-        if task.subtasks:  # its rewards pay at every step for what is done, its score once
+        if task.subtasks:  # rewards pay at every step for what is done, the score once
             scored = subtasks_completed(trajectories, task).astype(np.float64)
             facts["mean subtasks done"] = round(float(scored.mean()), 2)
         facts["mean normalised score"] = round(float(task.normalised_score(scored).mean()), 2)
@@ -103,7 +103,7 @@ def dimension_table(trajectories: Trajectories, task: Task | None = None) -> pd.
 
 
 def episode_table(trajectories: Trajectories) -> pd.DataFrame:
-    """One row an episode: `episode`, `steps`, `return`, `terminated`, `truncated`."""
+    """One row per episode: `episode`, `steps`, `return`, `terminated`, `truncated`."""
     last = trajectories.step_offsets[1:] - 1
     return pd.DataFrame(
         {
@@ -117,21 +117,21 @@ def episode_table(trajectories: Trajectories) -> pd.DataFrame:
 
 
 def visits(trajectories: Trajectories, task: Task, resolution: int = 1) -> NDArray[np.int64]:
-    """How often every place of a maze was visited.
+    """Count the visits to every part of a maze.
 
     Args:
         trajectories: Positions are the first two columns of the observations.
         task: A maze task.
-        resolution: n, squares a cell on each axis.
+        resolution: n, squares per cell on each axis.
 
     Returns:
         (n * rows, n * columns) counts in the order of the map: row 0 is the map's first row. Positions outside
         the map are not counted.
     """
-    assert task.maze_map is not None, "only mazes have places"
+    assert task.maze_map is not None, "only mazes can be divided into cells"
     rows, columns = len(task.maze_map) * resolution, len(task.maze_map[0]) * resolution
     corner = task.cell_to_xy((-0.5, -0.5))
-    step = (task.cell_to_xy((0.5, 0.5)) - corner) / resolution  # along x and down the map, signs and all
+    step = (task.cell_to_xy((0.5, 0.5)) - corner) / resolution  # along x and down the map, with their signs
     counts = np.zeros(rows * columns, np.int64)
     for block in _blocks(trajectories.observations[:, :2]):
         j, i = np.floor((block - corner) / step).astype(np.int64).T
@@ -147,7 +147,7 @@ def _visited(trajectories: Trajectories, task: Task) -> int:
 
 def _moments(values: NDArray[np.float32]) -> dict[str, NDArray[np.float64]]:
     """Lowest, mean, standard deviation and highest of each column (N, D)."""
-    origin = values[0].astype(np.float64)  # sums of squares about a value of the data lose no digits
+    origin = values[0].astype(np.float64)  # sums of squares around a value of the data lose no digits
     total, squares = np.zeros_like(origin), np.zeros_like(origin)
     for block in _blocks(values):
         away = block - origin

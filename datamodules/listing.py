@@ -1,4 +1,4 @@
-"""Which data sets there are: what `dds data list` prints."""
+"""Lists the data sets on this machine; what `dds data list` prints."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from dds_lightning.errors import UserError
 from dds_lightning.tasks import get_task, task_for_env, task_names
 
 HEAD = 10_000
-"""Rows of a D4RL file that are looked at."""
+"""Rows of a D4RL file that are inspected."""
 
 COLUMNS = ["data set", "data", "environment", "tasks", "episodes", "steps", "problem"]
 
 
 def find_datasets(roots: Iterable[str | Path] = ()) -> pd.DataFrame:
-    """The data sets in Minari's folder, in D4RL's and in others, without reading more than their outlines.
+    """The data sets in Minari's folder, in D4RL's and in others, reading only their outlines.
 
     Args:
-        roots: Folders to look in beside MINARI_DATASETS_PATH (or ~/.minari/datasets) and D4RL_DATASET_DIR (or
+        roots: Folders to search besides MINARI_DATASETS_PATH (or ~/.minari/datasets) and D4RL_DATASET_DIR (or
             ~/.d4rl/datasets). Minari data sets and folders of arrays are found at any depth, D4RL's files in
             the folder itself.
 
@@ -47,12 +47,12 @@ def find_datasets(roots: Iterable[str | Path] = ()) -> pd.DataFrame:
 
 
 def fitting_tasks(name: str, env_id: str = "", widths: tuple[int, int] | None = None) -> tuple[str, ...]:
-    """The tasks that a data set fits, as far as its outline tells: at least one of the last two must be known.
+    """The tasks that a data set fits, judged by its outline; `env_id` or `widths` must be known.
 
     Args:
-        name: Of the data set or file; one of the table's decides between tasks that all fit.
-        env_id: Where it was recorded, if it says so.
-        widths: Of its observations and actions.
+        name: Name of the data set or file; a name from the task table decides between tasks that all fit.
+        env_id: Environment in which it was recorded; empty if unknown.
+        widths: Widths of its observations and actions; None if unknown.
     """
     possible = [
         task
@@ -119,7 +119,7 @@ def _d4rl_outline(path: Path) -> dict[str, Any]:
         for key in fields.keys() - {"observations", "actions"}:
             flags = read_array(fields[key], where).reshape(-1)
             if len(flags) != len(ends):
-                raise DataError(f"{where}, {key}: found {len(flags)} rows, but terminals has {len(ends)}")
+                raise DataError(f"{where}, {key}: got {len(flags)} rows, but terminals has {len(ends)}")
             ends |= flags.astype(bool)
     names = tuple(name for name in fitting_tasks(path.name, widths=widths) if _may_hold(where, first, name))
     return _outline("", names, int(ends.sum()) + int(not ends[-1:].all()), len(ends))
@@ -134,7 +134,7 @@ def _may_hold(where: str, observations: NDArray[Any], name: str) -> bool:
 
 
 def _visible(root: Path, pattern: str) -> list[Path]:
-    """What matches below a folder and is not hidden: half-written data sets are."""
+    """Matches below a folder that are not hidden, as half-written data sets are."""
     return [
         path
         for path in sorted(root.glob(pattern))
@@ -144,7 +144,7 @@ def _visible(root: Path, pattern: str) -> list[Path]:
 
 def _width(array: Any, name: str) -> int:
     if len(array.shape) != 2:
-        raise DataError(f"{name}: found shape {tuple(array.shape)}, expected (steps, width)")
+        raise DataError(f"{name}: got shape {tuple(array.shape)}, expected (steps, width)")
     return int(array.shape[1])
 
 

@@ -50,9 +50,9 @@ class TensorLoader:
             device: Where the indices go.
         """
         if size < world_size:
-            raise UserError(f"data: found {size} items for {world_size} processes, expected at least one each")
+            raise UserError(f"data: got {size} items for {world_size} processes, expected at least one each")
         if batch_size < 1:
-            raise UserError(f"batch_size: found {batch_size}, expected at least 1")
+            raise UserError(f"batch_size: got {batch_size}, expected at least 1")
         self.gather, self.size, self.shuffle, self.seed = gather, size, shuffle, seed
         self.rank, self.world_size, self.device = rank, world_size, torch.device(device)
         self._share = size // world_size

@@ -1,4 +1,4 @@
-"""Codes of a relabelling that is under way, on disk."""
+"""The codes of an unfinished relabelling, on disk."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from torch import Tensor
 from dds_lightning.saving.files import written_whole
 
 
-class KeptCodes:
-    """Codes found so far, in a hidden file beside the result, so that relabelling goes on where it was stopped.
+class PartialCodes:
+    """The codes so far, in a hidden file beside the result, so that relabelling continues where it was stopped.
 
     Args:
-        path: the result's file.
-        key: what it is made from (`relabel_key`); codes of anything else are not read.
-        seconds: between two writes.
+        path: File of the result.
+        key: What the result is made from (`relabel_key`); codes of anything else are not read.
+        seconds: Time between two writes.
     """
 
     def __init__(self, path: Path, key: dict[str, str | int | float], seconds: float = 30.0) -> None:
@@ -30,7 +30,7 @@ class KeptCodes:
         self._written = time.monotonic()
 
     def read(self) -> list[Tensor]:
-        """The codes of the first segments, (n,) in one tensor; none if nothing fitting is there."""
+        """The codes of the first n segments, one tensor (n,); an empty list if no codes of this key are stored."""
         try:
             with np.load(self.path, allow_pickle=False) as stored:
                 return [torch.from_numpy(stored["codes"])] if str(stored["key"]) == self.key else []
@@ -38,17 +38,17 @@ class KeptCodes:
             return []
 
     def write(self, codes: list[Tensor]) -> None:
-        """Keep them."""
+        """Store the codes so far, (n,) each."""
         if codes:
             with written_whole(self.path) as part, part.open("wb") as file:
-                np.savez(file, allow_pickle=False, codes=torch.cat(codes).numpy(), key=np.array(self.key))
+                np.savez(file, codes=torch.cat(codes).numpy(), key=np.array(self.key))
         self._written = time.monotonic()
 
-    def write_now_and_then(self, codes: list[Tensor]) -> None:
-        """Keep them if some time has passed."""
+    def write_if_due(self, codes: list[Tensor]) -> None:
+        """Store them unless they were stored less than `seconds` ago."""
         if time.monotonic() - self._written >= self.seconds:
             self.write(codes)
 
     def remove(self) -> None:
-        """Forget them: the result is there."""
+        """Delete the file once the result exists."""
         self.path.unlink(missing_ok=True)

@@ -7,32 +7,32 @@
 ```
 
 A segment that reaches a *termination* after h < H steps is kept: its reward is discounted to the end, ``done`` cuts
-the bootstrap, and the encoder averages over the h steps alone. A segment that a *time-out* cuts short is dropped: the
-skill was not carried through, and nothing ended.
+the bootstrap, and the encoder averages over those h steps only. A segment that a *time-out* cuts short is dropped: the
+skill was not completed, and nothing ended.
 """
 
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import torch
-from rich.console import Console
-from rich.progress import track
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from datamodules.partial_codes import KeptCodes
+from datamodules.partial_codes import PartialCodes
+from datamodules.relabelling import Discount as Discount
+from datamodules.relabelling import Relabelling
 from datamodules.trajectories import Trajectories
+from dds_lightning.console.progress import on_terminal, track
 from dds_lightning.errors import UserError
 from dds_lightning.saving.files import refuse_newer, written_whole
 from dds_lightning.skill import SkillModule
 
-Discount = Literal["per_skill", "per_step"]
 FORMAT = 1
 _STORED = (
     "observations",
@@ -91,10 +91,10 @@ class Relabelled:
         return replace(self, **{name: getattr(self, name).to(device) for name in _STORED})
 
     def summary(self) -> pd.DataFrame:
-        """One row a code: share of the data, mean reward, mean displacement of the first two observations.
+        """One row per code: share of the data, mean reward, mean displacement of the first two observations.
 
         ``dx`` and ``dy`` are the mean change of the first two dimensions (the position in a maze) over a segment, in
-        the environment's units, ``distance`` the mean length of that change.
+        the environment's units; ``distance`` is the mean length of that change.
         """
         moved = (self.next_observations - self.observations)[:, :2].cpu().numpy()  # (M, 2)
         frame = pd.DataFrame(
@@ -118,27 +118,28 @@ class Relabelled:
         return table.astype({"segments": int, "terminations": int}).rename_axis("code").reset_index()
 
     def save(self, path: str | Path, key: dict[str, str | int | float]) -> None:
-        """Write the transitions and what they were made from, atomically, as one safetensors file."""
-        # In one entry: safetensors writes several in any order, and the same transitions shall be the same bytes.
+        """Write the transitions and `key`, what they were made from, atomically as one safetensors file."""
+        # In one entry: safetensors writes several in any order, but the same transitions must give the same bytes.
         about = {"format": FORMAT, "num_skills": self.num_skills, "key": key}
         metadata = {"about": json.dumps(about, sort_keys=True)}
         with written_whole(Path(path)) as part:
             try:
                 save_file({name: getattr(self, name).contiguous().cpu() for name in _STORED}, part, metadata=metadata)
-            except SafetensorError as error:  # its word for an error of the disk
+            except SafetensorError as error:  # how safetensors reports an error of the disk
                 raise UserError(f"{path} could not be written: {error}") from None
-            part.chmod(0o644)  # safetensors writes for the owner alone
+            part.chmod(0o644)  # safetensors makes files readable for the owner only
 
     @classmethod
     def load(cls, path: str | Path, key: dict[str, str | int | float] | None = None) -> "Relabelled":
         """Read a relabelled file.
 
         Args:
-            path: the file.
-            key: what it must have been made from; not checked without it.
+            path: The file.
+            key: What it must have been made from; None skips this check.
 
         Raises:
-            UserError: no such file, not a relabelled file, or made from something else (what, is named).
+            UserError: When there is no such file, it is not a relabelled file, or it was made from something else,
+                which the message names.
         """
         try:
             with safe_open(path, framework="pt") as file:
@@ -147,7 +148,7 @@ class Relabelled:
         except FileNotFoundError:
             raise UserError(f"there is no relabelled file {path}: make it with `dds relabel`") from None
         except Exception as error:
-            raise UserError(f"{path} is no readable relabelled file ({error}): delete it and relabel") from error
+            raise UserError(f"{path} is not a readable relabelled file ({error}): delete it and relabel") from error
         about = _about(metadata, path)
         found = about["key"]
         if key is not None and found != json.loads(json.dumps(key)):
@@ -158,23 +159,23 @@ class Relabelled:
             )
         damage = _misfit(tensors, about["num_skills"])
         if damage:
-            raise UserError(f"{path} is no readable relabelled file ({damage}): delete it and relabel")
+            raise UserError(f"{path} is not a readable relabelled file ({damage}): delete it and relabel")
         return cls(**tensors, num_skills=about["num_skills"])
 
 
 def _misfit(tensors: Mapping[str, Tensor], num_skills: int) -> str | None:
-    """What is wrong with the tensors of a file; None if they are transitions of that many codes."""
+    """What is wrong with the tensors of a file; None if they are transitions of `num_skills` codes."""
     if tensors.keys() != set(_STORED):
-        return f"it holds {', '.join(sorted(tensors)) or 'nothing'}, expected {', '.join(_STORED)}"
+        return f"it contains {', '.join(sorted(tensors)) or 'nothing'}, expected {', '.join(_STORED)}"
     rows = len(tensors["codes"]) if tensors["codes"].ndim else 0
     for name, value in tensors.items():
         wide = name in ("observations", "next_observations")
         if not rows or value.ndim != 1 + wide or len(value) != rows:
-            return f"{name} has shape {tuple(value.shape)}, expected {rows or 'some'} rows as codes"
+            return f"{name} has shape {tuple(value.shape)}, expected {rows or 'some'} rows like codes"
         if value.dtype != (torch.int64 if name in ("codes", "starts", "episodes") else torch.float32):
-            return f"{name} is of type {value.dtype}"
+            return f"{name} has type {value.dtype}"
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
-            return f"{name} holds numbers that are not finite"
+            return f"{name} contains numbers that are not finite"
     codes = tensors["codes"]
     if int(codes.min()) < 0 or int(codes.max()) >= num_skills:
         return f"codes run from {int(codes.min())} to {int(codes.max())}, expected 0 to {num_skills - 1}"
@@ -182,80 +183,72 @@ def _misfit(tensors: Mapping[str, Tensor], num_skills: int) -> str | None:
 
 
 def _about(metadata: Mapping[str, str], path: str | Path) -> dict[str, Any]:
-    """What a file says of itself; an earlier version wrote it in three entries.
+    """The description stored in a file; an earlier version wrote it in three entries.
 
     Raises:
-        UserError: it is of a newer version, or says nothing that can be understood.
+        UserError: When a newer version wrote it, or it cannot be parsed.
     """
     try:
         about = json.loads(metadata["about"]) if "about" in metadata else dict(metadata)
         found = json.loads(about["key"]) if isinstance(about["key"], str) else dict(about["key"])
-        told = {"format": int(about["format"]), "num_skills": int(about["num_skills"]), "key": found}
+        parsed = {"format": int(about["format"]), "num_skills": int(about["num_skills"]), "key": found}
     except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"{path} is no readable relabelled file ({error!r}): delete it and relabel") from None
-    refuse_newer(path, told["format"], FORMAT)
-    return told
+        raise UserError(f"{path} is not a readable relabelled file ({error!r}): delete it and relabel") from None
+    refuse_newer(path, parsed["format"], FORMAT)
+    return parsed
 
 
 def relabel_key(
-    trajectories: Trajectories,
-    skill: SkillModule,
-    *,
-    gamma: float,
-    discount: Discount,
-    stride: int,
-    reward_scale: float,
-    reward_shift: float,
+    trajectories: Trajectories, skill: SkillModule, relabelling: Relabelling | None = None, **settings: Any
 ) -> dict[str, str | int | float]:
-    """Everything a relabelled set depends on: data, skill weights, H, gamma, discount, stride, reward convention."""
-    return {
-        "data": trajectories.fingerprint(),
-        "skill": skill.fingerprint(),
-        "horizon": skill.horizon,
-        "gamma": gamma,
-        "discount": discount,
-        "stride": stride,
-        "reward_scale": reward_scale,
-        "reward_shift": reward_shift,
-    }
+    """Everything that a relabelled set depends on.
+
+    Args:
+        trajectories: The data.
+        skill: The skill model.
+        relabelling: The settings; None takes the defaults, without a task's reward convention.
+        **settings: Fields of `Relabelling` that differ from `relabelling`.
+
+    Returns:
+        Hashes of data and weights, H, and every field of `Relabelling`.
+    """
+    settings = _resolved(relabelling, settings).settings()
+    return {"data": trajectories.fingerprint(), "skill": skill.fingerprint(), "horizon": skill.horizon, **settings}
+
+
+def _resolved(relabelling: Relabelling | None, settings: dict[str, Any]) -> Relabelling:
+    return replace(relabelling or Relabelling(), **settings).for_task(None)
 
 
 @torch.inference_mode()
 def relabel(
     trajectories: Trajectories,
     skill: SkillModule,
+    relabelling: Relabelling | None = None,
     *,
-    gamma: float = 0.99,
-    discount: Discount = "per_skill",
-    stride: int = 1,
-    reward_scale: float = 1.0,
-    reward_shift: float = 0.0,
     batch_size: int = 2048,
     progress: bool = False,
-    kept: KeptCodes | None = None,
+    partial: PartialCodes | None = None,
+    **settings: Any,
 ) -> Relabelled:
     """Turn every segment into a semi-MDP transition (section 4.2).
 
     Args:
-        trajectories: the data.
-        skill: a discrete skill model of the same observation and action widths.
-        gamma: discount a step inside the segment, in (0, 1].
-        discount: ``per_skill`` bootstraps with gamma (the paper's formula), ``per_step`` with gamma^h.
-        stride: steps between the starts of two segments.
-        reward_scale: learning reward = reward_scale * (reward + reward_shift).
-        reward_shift: see ``reward_scale``.
-        batch_size: segments encoded at once.
-        progress: show a bar when standard error is a terminal.
-        kept: where codes are kept on the way and where those of an earlier, stopped call are.
+        trajectories: The data.
+        skill: A discrete skill model with the same observation and action widths.
+        relabelling: The settings; None takes the defaults, without a task's reward convention.
+        batch_size: Segments encoded at once.
+        progress: Show a bar when standard error is a terminal.
+        partial: Stores the codes so far, and has those of an earlier call that was stopped.
+        **settings: Fields of `Relabelling` that differ from `relabelling`.
 
     Raises:
-        UserError: widths that differ between data and model, no segment of H steps, gamma out of range.
+        UserError: When widths differ between data and model, no segment has H steps, or a setting is out of range.
     """
-    if not 0.0 < gamma <= 1.0:
-        raise UserError(f"gamma is {gamma}, expected a discount in (0, 1]")
+    settled = _resolved(relabelling, settings)
     check_widths(trajectories, skill)
     horizon = skill.horizon
-    windows = trajectories.windows(horizon, stride, tail="terminated")
+    windows = trajectories.windows(horizon, settled.stride, tail="terminated")
     starts, observation_starts, lengths = windows.starts, windows.observation_starts, windows.lengths
     steps = np.minimum(np.arange(horizon), lengths[:, None] - 1)  # (M, H): a short segment repeats its last step
     device = skill.device
@@ -270,30 +263,32 @@ def relabel(
             torch.as_tensor(lengths[rows], device=device) if short.any() else None,
         ).cpu()
 
-    codes = [] if kept is None else kept.read()
+    codes = [] if partial is None else partial.read()
     batches = range(sum(map(len, codes)), len(starts), batch_size)
     was_training = skill.training
     skill.eval()
-    console = Console(stderr=True)
-    hidden = not (progress and console.is_terminal)
+    layout, shown = ("{task.description}", "bar", "percent", "remaining"), progress and on_terminal()
     try:
-        for first in track(batches, "relabelling", console=console, disable=hidden, transient=True):
+        for first in track(batches, layout, len(batches), "relabelling", shown=shown):
             codes.append(encode(slice(first, first + batch_size)))
-            if kept is not None:
-                kept.write_now_and_then(codes)
+            if partial is not None:
+                partial.write_if_due(codes)
     except BaseException:
-        if kept is not None:
-            kept.write(codes)
+        if partial is not None:
+            partial.write(codes)
         raise
     finally:
         skill.train(was_training)
 
-    learning = reward_scale * (trajectories.rewards.astype(np.float64) + reward_shift)  # (N,)
+    assert settled.reward_scale is not None
+    assert settled.reward_shift is not None
+    learning = settled.reward_scale * (trajectories.rewards.astype(np.float64) + settled.reward_shift)  # (N,)
+    gamma = settled.gamma
     rewards = np.zeros(len(starts))
     for i in range(horizon):
         taken = i < lengths
         rewards[taken] += gamma**i * learning[starts[taken] + i]
-    factor = np.full(len(starts), gamma) if discount == "per_skill" else gamma**lengths
+    factor = np.full(len(starts), gamma) if settled.discount == "per_skill" else gamma**lengths
     ends = starts + lengths - 1  # (M,) last step of each segment
     return Relabelled(
         observations=torch.as_tensor(trajectories.observations[observation_starts]),
@@ -318,5 +313,5 @@ def check_widths(trajectories: Trajectories, skill: SkillModule) -> None:
         if found != expected:
             raise UserError(
                 f"the skill checkpoint has {name} {expected}, data set {trajectories.name!r} has {found}: "
-                "use a checkpoint trained on this task's data"
+                "use a checkpoint that was trained on this task's data"
             )

@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 from datamodules.loader import TensorLoader
-from datamodules.partial_codes import KeptCodes
-from datamodules.relabel import Discount, Relabelled, relabel, relabel_key
-from datamodules.sources import load_trajectories, resolve_task
+from datamodules.partial_codes import PartialCodes
+from datamodules.relabel import Relabelled, relabel, relabel_key
+from datamodules.relabelling import Relabelling
+from datamodules.sources import load_trajectories
 from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError
 from dds_lightning.skill import SkillModule
@@ -27,29 +28,28 @@ log = logging.getLogger(__name__)
 class RelabeledDataModule(pl.LightningDataModule):
     """Semi-MDP transitions of a data set under the skills of a checkpoint.
 
-    Relabelling runs once: its result lies under ``cache`` in a file named after the hash of data, skill weights, H,
-    gamma, discount, stride and reward convention, so that nothing stale is ever read.
+    Relabelling runs once: its result is stored under ``cache`` in a file named after the hash of data, skill weights,
+    H and every field of `Relabelling`, so that nothing stale is ever read.
 
     Args:
-        task: name of a task (``dds tasks``); null for your own data. The attribute ``task`` is, after ``setup``, the
+        task: Name of a task (``dds tasks``); null for your own data. After ``setup`` the attribute ``task`` is the
             variant in which the data were recorded.
-        data: where the data are, e.g. ``local:DIR``, ``minari:ID`` or ``d4rl:FILE``.
-        skill: skill checkpoint: a Lightning ``.ckpt`` or a published directory.
-        relabelled: read this file (of ``dds relabel``) instead of the cache; refused if made from anything else.
-        cache: folder of the cache; null puts it beside the skill checkpoint, or in the user's cache folder where that
+        data: Where the data are, e.g. ``local:DIR``, ``minari:ID`` or ``d4rl:FILE``.
+        skill: Skill checkpoint: a Lightning ``.ckpt`` or a published directory.
+        relabelled: Read this file (of ``dds relabel``) instead of the cache; refused if it was made from anything else.
+        cache: Folder of the cache; null puts it beside the skill checkpoint, or in the user's cache folder where that
             is a published directory.
-        gamma: discount a step.
-        discount: ``per_skill`` bootstraps with gamma (the paper), ``per_step`` with gamma^h.
-        stride: steps between the starts of two segments.
-        reward_scale: overrides the task's factor on the learning reward.
-        reward_shift: overrides the task's shift of the learning reward.
-        batch_size: transitions a batch.
-        validation_fraction: share of the episodes held out.
-        seed: of the split and of the order. On the command line it follows ``--seed_everything``; null means 0.
-        device_resident: keep the transitions on the accelerator.
+        batch_size: Transitions per batch.
+        validation_fraction: Share of the episodes held out.
+        seed: Seed of the split and of the order. On the command line it follows ``--seed_everything``; null means 0.
+        device_resident: Keep the transitions on the accelerator.
+        **relabelling: Fields of `Relabelling`: gamma, discount, stride, reward_scale, reward_shift.
+
+    Attributes:
+        relabelling: The settings of relabelling as they were given; ``settings`` has the task's in place of None.
     """
 
-    hparams: Any  # Lightning gives its settings as attributes, but types them as a mapping
+    hparams: Any  # Lightning types it as a mapping, but it also has attributes
 
     def __init__(
         self,
@@ -58,18 +58,16 @@ class RelabeledDataModule(pl.LightningDataModule):
         skill: str | None = None,
         relabelled: str | None = None,
         cache: str | None = None,
-        gamma: float = 0.99,
-        discount: Discount = "per_skill",
-        stride: int = 1,
-        reward_scale: float | None = None,
-        reward_shift: float | None = None,
         batch_size: int = 256,
         validation_fraction: float = 0.05,
         seed: int | None = None,
         device_resident: bool = False,
+        **relabelling: Any,
     ) -> None:
         super().__init__()
         seed = seed or 0
+        self.relabelling = Relabelling(**relabelling)
+        relabelling.update(self.relabelling.settings())  # defaults included
         self.save_hyperparameters()
         self.task: Task | None = get_task(task) if task else None
         if skill is None:
@@ -92,16 +90,16 @@ class RelabeledDataModule(pl.LightningDataModule):
 
     @cached_property
     def trajectories(self) -> Trajectories:
-        """The data set, loaded at first use; from then on ``task`` is the variant it was recorded in."""
+        """The data set, loaded at first use; from then on ``task`` is the variant in which it was recorded."""
         if self._given is not None:
             return self._given
         if self.hparams.data is None:
             raise UserError(
                 "data.data is missing: give local:DIR, minari:ID or d4rl:FILE, or collect with `dds data collect TASK`"
             )
-        if self.task is not None:
-            self.task = resolve_task(self.hparams.data, self.task)
-        return load_trajectories(self.hparams.data, self.task)
+        trajectories = load_trajectories(self.hparams.data, self.task)
+        self.task = trajectories.task
+        return trajectories
 
     @property
     def batch_size(self) -> int:
@@ -115,30 +113,21 @@ class RelabeledDataModule(pl.LightningDataModule):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What relabelling depends on beside data and skills."""
-        h = self.hparams
-        scale = self.task.reward_scale if self.task else 1.0
-        shift = self.task.reward_shift if self.task else 0.0
-        return {
-            "gamma": h.gamma,
-            "discount": h.discount,
-            "stride": h.stride,
-            "reward_scale": scale if h.reward_scale is None else h.reward_scale,
-            "reward_shift": shift if h.reward_shift is None else h.reward_shift,
-        }
+        """What relabelling depends on beside data and skills: the fields of `Relabelling`."""
+        return self.relabelling.for_task(self.task).settings()
 
     @cached_property
     def key(self) -> dict[str, str | int | float]:
-        """Everything the relabelled data depend on; hashes data and weights, so worked out once."""
-        return relabel_key(self.trajectories, self.skill, **self.settings)
+        """Everything the relabelled data depend on; computed once, because it hashes data and weights."""
+        return relabel_key(self.trajectories, self.skill, self.relabelling.for_task(self.task))
 
     def cache_file(self) -> Path:
-        """Where the relabelled data of exactly these inputs lie."""
+        """File of the relabelled data of exactly these inputs."""
         name = hashlib.sha256(json.dumps(self.key, sort_keys=True).encode()).hexdigest()[:16]
         return self._cache_folder() / f"relabelled-{name}.safetensors"
 
     def _cache_folder(self) -> Path:
-        """The folder asked for, else beside a training's checkpoint; nothing is added to a published directory."""
+        """The given folder, else beside the checkpoint of a training; nothing is added to a published directory."""
         if self.hparams.cache:
             return Path(self.hparams.cache)
         skill = Path(self.hparams.skill)
@@ -147,16 +136,17 @@ class RelabeledDataModule(pl.LightningDataModule):
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dds-lightning"
 
     def prepare_data(self) -> None:
-        """Relabel, unless the result of exactly these inputs is on disk."""
+        """Relabel, unless the result of exactly these inputs is stored."""
         if self.hparams.relabelled is None and not self.cache_file().exists():
             self.relabel_into(self.cache_file())
 
     def relabel_into(self, path: Path) -> Relabelled:
-        """Relabel and write the result to `path`; a call that was stopped goes on when it is made again."""
-        kept = KeptCodes(path, self.key)
-        made = relabel(self.trajectories, self.skill, **self.settings, progress=True, kept=kept)
+        """Relabel and write the result to `path`; repeating a call that was stopped continues it."""
+        partial = PartialCodes(path, self.key)
+        relabelling = self.relabelling.for_task(self.task)
+        made = relabel(self.trajectories, self.skill, relabelling, progress=True, partial=partial)
         made.save(path, self.key)
-        kept.remove()
+        partial.remove()
         log.info("relabelled %d segments into %s", len(made), path)
         return made
 
@@ -168,14 +158,12 @@ class RelabeledDataModule(pl.LightningDataModule):
         self.transitions = Relabelled.load(path, self.key)
         h = self.hparams
         _, held_out = self.trajectories.split(h.validation_fraction, h.seed, self.skill.horizon)
-        kept = torch.isin(self.transitions.episodes, torch.as_tensor(held_out))
-        self.train_index, self.validation_index = (
-            torch.nonzero(~kept).flatten(),
-            torch.nonzero(kept).flatten(),
-        )
+        validates = torch.isin(self.transitions.episodes, torch.as_tensor(held_out))
+        self.train_index = torch.nonzero(~validates).flatten()
+        self.validation_index = torch.nonzero(validates).flatten()
 
     def statistics(self) -> dict[str, Any]:
-        """What the policy keeps of the data: normalisation, code shares, range of rewards, greatest discount."""
+        """What the policy needs of the data: normalisation, code shares, range of rewards, greatest discount."""
         assert self.transitions is not None, "setup() comes first"
         t, i = self.transitions, self.train_index
         observations, rewards = t.observations[i], t.rewards[i]

@@ -1,4 +1,4 @@
-"""Batches of segments for skill training: every tensor in memory, every batch one fancy index."""
+"""Batches of segments for skill training: all tensors in memory, each batch one fancy index."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from datamodules.collect.collectors import can_collect
 from datamodules.loader import Batch, TensorLoader
-from datamodules.sources import load_trajectories, resolve_task
+from datamodules.sources import load_trajectories
 from datamodules.trajectories import Trajectories, Windows
 from dds_lightning.errors import UserError
 from dds_lightning.nn.normaliser import MIN_STD
@@ -28,15 +28,15 @@ zero."""
 class SegmentDataModule(pl.LightningDataModule):
     """Sliding windows over offline episodes, as batches `{"observations": (B, H, O), "actions": (B, H, A)}`.
 
-    Units are raw; the model normalises with `statistics()`. Windows never cross an episode. Training and
-    validation have no episode in common.
+    Values are in raw units; the model normalises with `statistics()`. Windows never cross an episode. Training and
+    validation share no episode.
 
-    From your own arrays: `SegmentDataModule.from_trajectories(Trajectories.from_episodes("mine", episodes))`;
-    the form of `episodes` is in the docstring of `datamodules.trajectories`.
+    For your own arrays: `SegmentDataModule.from_trajectories(Trajectories.from_episodes("mine", episodes))`;
+    the docstring of `datamodules.trajectories` shows the form of `episodes`.
 
     Attributes:
         trajectories: All data, after `setup`.
-        task: What the data are for; after `setup` the variant in which they were recorded.
+        task: The task of the data; after `setup` the variant in which they were recorded.
         horizon: H.
     """
 
@@ -54,28 +54,28 @@ class SegmentDataModule(pl.LightningDataModule):
         device_resident: bool = False,
         max_validation_segments: int = 4096,
     ) -> None:
-        """Say which data; nothing is read yet.
+        """Choose the data; nothing is read yet.
 
         Args:
-            task: Name of a task (`dds tasks` lists them). The data must fit it. None takes any sound data.
+            task: Name of a task (`dds tasks` lists them). The data must fit it. None accepts any valid data.
             data: For example `local:DIR`, `minari:ID` or `d4rl:FILE`, see `datamodules.load_trajectories`.
             horizon: H, steps of a segment.
             stride: Steps between segments: 1 takes every window, H divides episodes into separate segments.
             batch_size: B.
-            validation_fraction: Share of the steps, in whole episodes, that is kept for validation.
-            seed: Of the split and of the order of batches. On the command line it follows `--seed_everything`;
+            validation_fraction: Share of the steps, in whole episodes, that is held out for validation.
+            seed: Seed of the split and of the order of batches. On the command line it follows `--seed_everything`;
                 None means 0.
             device_resident: Keep the data on the training device; batches are then made there.
-            max_validation_segments: At most this many segments, evenly spread, are validated.
+            max_validation_segments: Greatest number of segments, evenly spread, that are validated.
         """
         super().__init__()
         for name, value in (("horizon", horizon), ("stride", stride), ("batch_size", batch_size)):
             if value < 1:
-                raise UserError(f"{name}: found {value}, expected at least 1")
+                raise UserError(f"{name}: got {value}, expected at least 1")
         if max_validation_segments < 1:
-            raise UserError(f"max_validation_segments: found {max_validation_segments}, expected at least 1")
+            raise UserError(f"max_validation_segments: got {max_validation_segments}, expected at least 1")
         if not 0.0 <= validation_fraction < 1.0:
-            raise UserError(f"validation_fraction: found {validation_fraction}, expected 0 to less than 1")
+            raise UserError(f"validation_fraction: got {validation_fraction}, expected 0 to less than 1")
         self.task = get_task(task) if task is not None else None
         self.data, self.horizon, self.stride, self.batch_size = data, horizon, stride, batch_size
         self.validation_fraction, self.seed = validation_fraction, seed or 0
@@ -85,21 +85,21 @@ class SegmentDataModule(pl.LightningDataModule):
 
     @classmethod
     def from_trajectories(cls, trajectories: Trajectories, **options: Any) -> SegmentDataModule:
-        """The same over data that are in memory already; `options` are those of the constructor."""
+        """Use trajectories that are in memory already; `options` are arguments of the constructor."""
         module = cls(**options)
         module.trajectories = trajectories
         return module
 
-    # ------------------------------------------------------------------ what the model must know
+    # ------------------------------------------------------------------ what the model needs to know
 
     @property
     def observation_dim(self) -> int:
-        """O, from the task's row, else from the data."""
+        """O, from the task, or from the data without one."""
         return self.task.observation_dim if self.task is not None else self._loaded().observation_dim
 
     @property
     def action_dim(self) -> int:
-        """A, from the task's row, else from the data."""
+        """A, from the task, or from the data without one."""
         return self.task.action_dim if self.task is not None else self._loaded().action_dim
 
     def statistics(self) -> dict[str, Tensor]:
@@ -132,7 +132,7 @@ class SegmentDataModule(pl.LightningDataModule):
     # ------------------------------------------------------------------ Lightning's hooks
 
     def setup(self, stage: str | None = None) -> None:
-        """Read the data, find the windows, split by episode; does nothing the second time."""
+        """Read the data, find the windows and split by episode; a second call does nothing."""
         if self._windows is not None:
             return
         data = self._loaded()
@@ -168,25 +168,24 @@ class SegmentDataModule(pl.LightningDataModule):
         assert self._windows is not None
         return self._loader(np.arange(len(self._windows)))
 
-    # ------------------------------------------------------------------ inside
+    # ------------------------------------------------------------------ helpers
 
     def _loaded(self) -> Trajectories:
         if not hasattr(self, "trajectories"):
             if self.data is None:
                 raise UserError(self._how_to_get_data())
-            if self.task is not None:
-                self.task = resolve_task(self.data, self.task)
             self.trajectories = load_trajectories(self.data, self.task)
+            self.task = self.trajectories.task
         return self.trajectories
 
     def _how_to_get_data(self) -> str:
         if self.task is None:
-            return "data: neither a task nor data were given; give at least data, for example local:DIR"
+            return "data: expected a task or data, got neither; give at least data, for example local:DIR"
         if not can_collect(self.task):
-            return f"data: none was given for task '{self.task.name}'; give d4rl:FILE or minari:ID"
+            return f"data: none were given for task '{self.task.name}'; give d4rl:FILE or minari:ID"
         collected = f"`dds data collect {self.task.name} --out data`"
         place = f"local:data/{self.task.data_ids.get('local', self.task.name)}"
-        return f"data: none was given for task '{self.task.name}'; {collected} makes some, then give {place}"
+        return f"data: none were given for task '{self.task.name}'; {collected} collects some, then give {place}"
 
     def _loader(self, segments: NDArray[np.int64], **options: Any) -> TensorLoader:
         assert self._windows is not None
@@ -209,7 +208,7 @@ class SegmentDataModule(pl.LightningDataModule):
     def _tensors(self, device: torch.device) -> tuple[Tensor, Tensor]:
         if device not in self._on_device:
             with warnings.catch_warnings():
-                # Memory maps are read-only; batches are copies, so nothing writes through these tensors.
+                # Memory maps are read-only, and batches are copies: nothing writes through these tensors.
                 warnings.filterwarnings("ignore", message=".*not writable.*")
                 observations = torch.from_numpy(self.trajectories.observations).to(device)
                 actions = torch.from_numpy(self.trajectories.actions).to(device)

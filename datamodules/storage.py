@@ -1,4 +1,4 @@
-"""Arrays as plain .npy files in one folder, which can be memory-mapped when they do not fit into memory."""
+"""Stores arrays as plain .npy files in a folder, which can be memory-mapped when they do not fit into memory."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ FORMAT = 1
 def save_arrays(
     directory: str | Path, arrays: Mapping[str, NDArray[Any]], facts: Mapping[str, Any], *, overwrite: bool = False
 ) -> Path:
-    """Write `directory` with one .npy file an array and `trajectories.json`, which holds `facts` and the format.
+    """Write `directory` with one .npy file per array and `trajectories.json`, which has `facts` and the format.
 
-    The folder is whole or absent (`dds_lightning.saving.files.folder_written_whole`).
+    The folder is complete or absent (`dds_lightning.saving.files.folder_written_whole`).
 
     Raises:
         UserError: When the folder exists and `overwrite` is False.
@@ -41,7 +41,7 @@ def save_arrays(
 
 def read_arrays(
     directory: str | Path, types: Mapping[str, Any], *, mmap: bool = False
-) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read what `save_arrays` wrote.
 
     Args:
@@ -73,7 +73,7 @@ def read_arrays(
         except (OSError, ValueError, EOFError) as error:
             raise DataError(f"data set '{name}': {path} is missing, truncated or damaged ({error})") from error
         if arrays[key].dtype != dtype:
-            raise DataError(f"data set '{name}', {key}: found type {arrays[key].dtype}, expected {np.dtype(dtype)}")
+            raise DataError(f"data set '{name}', {key}: got type {arrays[key].dtype}, expected {np.dtype(dtype)}")
     return facts, arrays
 
 
@@ -81,4 +81,4 @@ def refuse_existing(folder: Path, overwrite: bool) -> None:
     """Raise UserError when `folder` exists and may not be replaced."""
     mend_folder(folder)
     if folder.exists() and not overwrite:
-        raise UserError(f"out: {folder} exists already; choose another place, or ask for it to be overwritten")
+        raise UserError(f"out: {folder} exists already; choose another folder, or allow it to be overwritten")

@@ -1,4 +1,4 @@
-"""The one container of offline data: flat arrays for episodes of different length.
+"""The container of offline data: flat arrays for episodes of different lengths.
 
     episode 0 (T = 3)                 episode 1 (T = 2)
     o0  o1  o2  o3                    o4  o5  o6              observations, N + E rows
@@ -8,7 +8,7 @@
 
 Step `s` of episode `e` acts on observation row `s + e` and leads to row `s + e + 1`.
 
-Your own arrays come in by `Trajectories.from_episodes`:
+Your own arrays become `Trajectories` by `Trajectories.from_episodes`:
 
     episodes = [
         {
@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -37,6 +37,7 @@ from numpy.typing import ArrayLike, NDArray
 from datamodules.storage import read_arrays, save_arrays
 from datamodules.validation import DataError, validate_episode
 from datamodules.windows import Windows, ranges, sliding_windows
+from dds_lightning.tasks import Task
 
 __all__ = ["DataError", "Trajectories", "Windows"]
 
@@ -55,20 +56,22 @@ ARRAY_TYPES = {
 
 @dataclass(frozen=True, eq=False)
 class Trajectories:
-    """Episodes in flat arrays (in memory or memory-mapped); see the module's picture.
+    """Episodes in flat arrays (in memory or memory-mapped); see the picture in the module's docstring.
 
-    Make one with `from_episodes`, `load` or `datamodules.load_trajectories`: those check what they are given.
+    Create one with `from_episodes`, `load` or `datamodules.load_trajectories`: these check their input.
 
     Attributes:
-        name: Of the data set.
+        name: Name of the data set.
         observations: (N + E, O) float32; episode e has lengths[e] + 1 rows.
         actions: (N, A) float32.
-        rewards: (N,) float32, in the environment's unit (the task's scale and shift come later).
-        terminations: (N,) bool, True where the task ended: there is nothing to bootstrap from.
+        rewards: (N,) float32, in the environment's units (the task's scale and shift are applied later).
+        terminations: (N,) bool, True where the task ended, so that there is nothing to bootstrap from.
         truncations: (N,) bool, True where only the recording ended.
-        lengths: (E,) int64, steps of each episode.
+        lengths: (E,) int64, number of steps of each episode.
         action_low: (A,) float32.
         action_high: (A,) float32.
+        task: The task, in its variant, that the data were loaded for; None if unknown. It is neither stored nor part
+            of the fingerprint.
     """
 
     name: str
@@ -80,8 +83,9 @@ class Trajectories:
     lengths: NDArray[np.int64]
     action_low: NDArray[np.float32]
     action_high: NDArray[np.float32]
+    task: Task | None = field(default=None, kw_only=True)
 
-    # ------------------------------------------------------------------ making one
+    # ------------------------------------------------------------------ creating one
 
     @classmethod
     def from_episodes(
@@ -95,20 +99,20 @@ class Trajectories:
         action_dim: int | None = None,
         episode_names: Sequence[str] | None = None,
     ) -> Trajectories:
-        """Check episodes and lay them end to end.
+        """Check episodes and concatenate them.
 
         Args:
-            name: Of the data set, for messages.
-            episodes: Mappings of the five fields in the module's docstring; other entries are ignored.
-            action_low: Lower bound of actions, one number or (A,).
-            action_high: Upper bound of actions.
+            name: Name of the data set, for messages.
+            episodes: Mappings with the five fields in the module's docstring; other entries are ignored.
+            action_low: Lower bounds of actions, one number or (A,).
+            action_high: Upper bounds of actions, one number or (A,).
             observation_dim: O; None takes the first episode's.
             action_dim: A; None takes the first episode's.
             episode_names: What messages call the episodes; None counts from "episode 0".
 
         Raises:
-            DataError: When there is no episode, or one is not as it must be; the message names the data set,
-                the episode, the field and the value.
+            DataError: When there is no episode, or one is invalid; the message names the data set, the episode, the
+                field and the value.
         """
         if not len(episodes):
             raise DataError(f"data set '{name}' is empty: it has no episodes")
@@ -122,18 +126,18 @@ class Trajectories:
             validate_episode(name, label, fields, observation_dim=observation_dim, action_low=low, action_high=high)
             for label, fields in zip(names, episodes, strict=True)
         ]
-        joined = {key: np.concatenate([fields[key] for fields in checked]) for key in checked[0]}
+        joined: dict[str, Any] = {key: np.concatenate([fields[key] for fields in checked]) for key in checked[0]}
         lengths = np.array([len(fields["rewards"]) for fields in checked], np.int64)
         return cls(name=name, lengths=lengths, action_low=low, action_high=high, **joined)
 
     def select(self, episode_ids: ArrayLike) -> Trajectories:
-        """A new container with these episodes, in this order (a copy)."""
+        """A copy with these episodes only, in this order."""
         ids = np.asarray(episode_ids, np.int64)
         if not ids.size:
             raise DataError(f"data set '{self.name}': no episodes were selected")
         if ids.min() < 0 or ids.max() >= self.num_episodes:
             raise DataError(
-                f"data set '{self.name}': episode {ids.min() if ids.min() < 0 else ids.max()} was asked for, "
+                f"data set '{self.name}': episode {ids.min() if ids.min() < 0 else ids.max()} was requested, "
                 f"expected 0 to {self.num_episodes - 1}"
             )
         steps = ranges(self.step_offsets[ids], self.lengths[ids])
@@ -147,6 +151,12 @@ class Trajectories:
             truncations=self.truncations[steps],
             lengths=self.lengths[ids],
         )
+
+    def for_task(self, task: Task | None) -> Trajectories:
+        """The same data for a task, without copying an array or computing the fingerprint again."""
+        same = replace(self, task=task)
+        vars(same).update({name: value for name, value in vars(self).items() if name not in vars(same)})
+        return same
 
     # ------------------------------------------------------------------ what is in it
 
@@ -222,15 +232,15 @@ class Trajectories:
         return np.searchsorted(self.step_offsets, np.asarray(steps), side="right") - 1
 
     def split(self, fraction: float, seed: int, horizon: int = 1) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Episodes for training and for validation, none in both.
+        """Divide the episodes into training and validation.
 
-        Episodes are drawn at random until they hold `fraction` of all steps. Those shorter than `horizon`
-        stay with training, where they are left out anyway.
+        Validation episodes are drawn at random until they have `fraction` of all steps. Episodes shorter than
+        `horizon` stay with training, where they are left out anyway.
 
         Args:
-            fraction: Share of the steps that is put aside; 0 puts nothing aside.
-            seed: Same seed, same split.
-            horizon: Steps that an episode must have to be of use.
+            fraction: Share of the steps that is held out; 0 holds out nothing.
+            seed: The same seed gives the same split.
+            horizon: Fewest steps of an episode that may be held out.
 
         Returns:
             Sorted episode numbers for training and for validation.
@@ -239,7 +249,7 @@ class Trajectories:
             DataError: When there is only one episode to divide, or `fraction` is out of range.
         """
         if not 0.0 <= fraction < 1.0:
-            raise DataError(f"validation_fraction: found {fraction}, expected at least 0 and less than 1")
+            raise DataError(f"validation_fraction: got {fraction}, expected at least 0 and less than 1")
         everything = np.arange(self.num_episodes)
         if fraction == 0:
             return everything, everything[:0]
@@ -248,7 +258,7 @@ class Trajectories:
         if len(usable) < 2:
             raise DataError(
                 f"data set '{self.name}': {len(usable)} of its episodes have {horizon} steps, so none can be "
-                "put aside for validation; use more data, or validation_fraction 0"
+                "held out for validation; use more data, or validation_fraction 0"
             )
         before = np.cumsum(self.lengths[usable]) - self.lengths[usable]
         count = int(np.sum(before < fraction * self.num_steps))
@@ -265,7 +275,7 @@ class Trajectories:
     # ------------------------------------------------------------------ on disk
 
     def save(self, directory: str | Path, *, overwrite: bool = False) -> Path:
-        """Write a folder of .npy files, whole or not at all; see `datamodules.storage`."""
+        """Write a folder of .npy files, completely or not at all; see `datamodules.storage`."""
         facts = {"name": self.name, "fingerprint": self.fingerprint()}
         return save_arrays(directory, self.arrays(), facts, overwrite=overwrite)
 
@@ -276,7 +286,7 @@ class Trajectories:
         Args:
             directory: The folder.
             mmap: Map the arrays instead of reading them: memory is filled as they are used.
-            verify: Compare with the stored fingerprint, which reads everything once.
+            verify: Compare with the stored fingerprint, for which all arrays are read once.
 
         Raises:
             DataError: When a file is missing, damaged or does not match.
@@ -286,7 +296,7 @@ class Trajectories:
         rows = {"actions": steps, "terminations": steps, "truncations": steps, "observations": steps + episodes}
         for key, expected in rows.items():
             if len(arrays[key]) != expected:
-                raise DataError(f"data set '{name}', {key}: found {len(arrays[key])} rows, expected {expected}")
+                raise DataError(f"data set '{name}', {key}: got {len(arrays[key])} rows, expected {expected}")
         if arrays["lengths"].sum() != steps:
             raise DataError(f"data set '{name}', lengths: they add up to {arrays['lengths'].sum()}, expected {steps}")
         trajectories = cls(name=name, **arrays)

@@ -1,8 +1,7 @@
-"""What a data set must be. Every refusal names the data set, the episode, the field and the value.
+"""Checks of data sets. Every error names the data set, the episode, the field and the value.
 
-File formats accept almost anything (not-a-number, one observation too few, episodes without an end), and a
-learner trained on such data fails late and silently. So everything that enters a `Trajectories` passes
-through here.
+File formats accept almost anything (NaN, one observation too few, episodes without an end), and a learner trained
+on such data fails late and silently. So all data pass these checks before they become `Trajectories`.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from dds_lightning.errors import UserError
 
 FIELDS = ("observations", "actions", "rewards", "terminations", "truncations")
 BOX_TOLERANCE = 1e-5
-"""Actions may leave the box by this much (rounding); they are clipped into it."""
+"""Actions may exceed their box by this much (rounding); they are clipped to it."""
 
 
 class DataError(UserError):
@@ -33,13 +32,13 @@ def validate_episode(
     action_low: NDArray[np.float32],
     action_high: NDArray[np.float32],
 ) -> dict[str, NDArray[Any]]:
-    """Check one episode and bring it to the types of `Trajectories`.
+    """Check one episode and convert it to the types of `Trajectories`.
 
     Args:
         dataset: Name of the data set, for messages.
         episode: Name of the episode, for messages.
         fields: `FIELDS` to arrays; observations (T + 1, O), actions (T, A), the rest (T,).
-        observation_dim: O; None takes the episode's own.
+        observation_dim: O; None accepts any width.
         action_low: (A,) lower bounds of the action box.
         action_high: (A,) upper bounds.
 
@@ -47,13 +46,13 @@ def validate_episode(
         The five arrays: float32 for numbers, bool for flags, actions clipped into the box.
 
     Raises:
-        DataError: At the first thing wrong.
+        DataError: At the first problem.
     """
     where = f"data set '{dataset}', {episode}"
     for name in FIELDS:
         if name not in fields or fields[name] is None:
             found = ", ".join(fields) or "nothing"
-            raise DataError(f"{where}: '{name}' is missing; expected {', '.join(FIELDS)}, found {found}")
+            raise DataError(f"{where}: '{name}' is missing; expected {', '.join(FIELDS)}, got {found}")
     arrays = {name: _array(where, name, fields[name]) for name in FIELDS}
     _check_shapes(where, arrays, observation_dim, len(action_low))
     for name in ("observations", "actions", "rewards"):
@@ -71,11 +70,11 @@ def _array(where: str, name: str, value: Any) -> NDArray[Any]:
     flag = name in ("terminations", "truncations")
     if array.dtype.kind not in ("b" if flag else "fiu") and not (flag and array.dtype.kind in "iu"):
         expected = "true and false" if flag else "real numbers"
-        raise DataError(f"{where}, {name}: found values of type {array.dtype}, expected {expected}")
+        raise DataError(f"{where}, {name}: got values of type {array.dtype}, expected {expected}")
     if flag and array.dtype.kind != "b":
         odd = array[(array != 0) & (array != 1)]
         if odd.size:
-            raise DataError(f"{where}, {name}: found {odd.flat[0]}, expected 0 or 1")
+            raise DataError(f"{where}, {name}: got {odd.flat[0]}, expected 0 or 1")
         return array.astype(bool)
     return array
 
@@ -86,19 +85,19 @@ def _check_shapes(where: str, arrays: dict[str, NDArray[Any]], observations: int
         shape = arrays[name].shape
         if len(shape) != 2 or shape[1] != (shape[1] if width is None else width):
             expected = "(steps, any)" if width is None else f"(steps, {width})"
-            raise DataError(f"{where}, {name}: found shape {shape}, expected {expected}")
+            raise DataError(f"{where}, {name}: got shape {shape}, expected {expected}")
     for name in ("rewards", "terminations", "truncations"):
         if arrays[name].ndim != 1:
-            raise DataError(f"{where}, {name}: found shape {arrays[name].shape}, expected (steps,)")
+            raise DataError(f"{where}, {name}: got shape {arrays[name].shape}, expected (steps,)")
     if steps == 0:
-        raise DataError(f"{where}, rewards: found 0 steps, expected at least 1")
+        raise DataError(f"{where}, rewards: got 0 steps, expected at least 1")
     for name in ("actions", "terminations", "truncations"):
         if len(arrays[name]) != steps:
-            raise DataError(f"{where}, {name}: found {len(arrays[name])} rows, but rewards has {steps}")
+            raise DataError(f"{where}, {name}: got {len(arrays[name])} rows, but rewards has {steps}")
     seen = len(arrays["observations"])
     if seen != steps + 1:
         missing = "; the observation after the last step is missing" if seen == steps else ""
-        raise DataError(f"{where}, observations: found {seen} rows, expected {steps + 1} (T + 1){missing}")
+        raise DataError(f"{where}, observations: got {seen} rows, expected {steps + 1} (T + 1){missing}")
 
 
 def finite(where: str, array: NDArray[Any], *, first: int = 0, unit: str = "step") -> NDArray[np.float32]:
@@ -107,8 +106,8 @@ def finite(where: str, array: NDArray[Any], *, first: int = 0, unit: str = "step
     Args:
         where: Data set, episode and field, as messages begin.
         array: (N,) or (N, columns).
-        first: Number of the first row, where `array` is a part of something longer.
-        unit: What messages call a row.
+        first: Number of the first row, where `array` is part of a longer array.
+        unit: Name of a row in messages.
 
     Raises:
         DataError: For numbers that are not finite, or too large for 32 bits.
@@ -119,7 +118,7 @@ def finite(where: str, array: NDArray[Any], *, first: int = 0, unit: str = "step
     if len(bad):
         index = tuple(int(i) for i in bad[0])
         place = f"{unit} {first + index[0]}" + (f", column {index[1]}" if len(index) > 1 else "")
-        raise DataError(f"{where}: found {array[index]} at {place}, expected finite 32-bit numbers")
+        raise DataError(f"{where}: got {array[index]} at {place}, expected finite 32-bit numbers")
     return single
 
 
@@ -132,10 +131,10 @@ def in_box(
     first: int = 0,
     unit: str = "step",
 ) -> NDArray[np.float32]:
-    """Actions clipped into their box, which they may leave by `BOX_TOLERANCE`.
+    """Actions clipped to their box, which they may exceed by `BOX_TOLERANCE`.
 
     Args:
-        where: As for `finite`, likewise `first` and `unit`.
+        where: See `finite`.
         actions: (N, A).
         low: (A,).
         high: (A,).
@@ -143,13 +142,13 @@ def in_box(
         unit: See `finite`.
 
     Raises:
-        DataError: For actions further outside.
+        DataError: For actions that exceed it by more.
     """
     outside = np.argwhere((actions < low - BOX_TOLERANCE) | (actions > high + BOX_TOLERANCE))
     if len(outside):
         t, j = (int(i) for i in outside[0])
         raise DataError(
-            f"{where}: found {actions[t, j]:g} at {unit} {first + t}, column {j}, expected {low[j]:g} to {high[j]:g}"
+            f"{where}: got {actions[t, j]:g} at {unit} {first + t}, column {j}, expected {low[j]:g} to {high[j]:g}"
         )
     return np.clip(actions, low, high)
 
@@ -159,7 +158,7 @@ def _check_ends(where: str, arrays: dict[str, NDArray[Any]]) -> None:
         early = np.flatnonzero(arrays[name][:-1])
         if len(early):
             raise DataError(
-                f"{where}, {name}: found True at step {early[0]}, inside an episode of {len(arrays[name])} "
+                f"{where}, {name}: got True at step {early[0]}, inside an episode of {len(arrays[name])} "
                 "steps; expected it on the last step only"
             )
     if not (arrays["terminations"][-1] or arrays["truncations"][-1]):

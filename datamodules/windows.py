@@ -1,4 +1,4 @@
-"""Which segments an episode holds."""
+"""Finds the segments of episodes."""
 
 from __future__ import annotations
 
@@ -52,24 +52,23 @@ def sliding_windows(
                                       └      h = 1: only with tail = "terminated"
 
     Args:
-        name: Of the data set, for messages.
+        name: Name of the data set, for messages.
         lengths: (E,) steps of each episode.
         terminated: (E,) whether each episode ends in a termination.
         horizon: H, steps of a window.
-        stride: Steps between the starts of two windows of one episode; H divides episodes into separate
-            parts.
+        stride: Steps between the starts of two windows of one episode; H makes them disjoint.
         tail: "full" takes windows of H steps only. "terminated" also takes the shorter ones that end in a
-            termination: they tell the learner where episodes end. Windows cut by a time-out are never taken,
-            because nothing is known of the steps that they lack.
+            termination, from which the learner sees where episodes end. Windows cut short by a time-out are never
+            taken, because nothing is known about the missing steps.
 
     Raises:
-        DataError: When no episode is long enough, or a setting is out of range. Some that are too short are
-            left out with one warning, which counts them.
+        DataError: When no episode is long enough, or a setting is out of range. If only some episodes are too short,
+            they are left out with one warning, which counts them.
     """
     if horizon < 1 or stride < 1:
-        raise DataError(f"horizon and stride: found {horizon} and {stride}, expected at least 1")
+        raise DataError(f"horizon and stride: got {horizon} and {stride}, expected at least 1")
     if tail not in ("full", "terminated"):
-        raise DataError(f"tail: found '{tail}', expected 'full' or 'terminated'")
+        raise DataError(f"tail: got '{tail}', expected 'full' or 'terminated'")
     # Windows may start at 0, stride, 2 * stride, ... up to (not including) this step of the episode.
     stop = np.maximum(lengths - horizon + 1, 0)
     if tail == "terminated":
@@ -103,7 +102,7 @@ def _report_short(name: str, lengths: NDArray[np.int64], horizon: int, dropped: 
 
 
 def ranges(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """`starts[0], ..., starts[0] + counts[0] - 1`, then the same of the next, end to end."""
+    """`starts[0], ..., starts[0] + counts[0] - 1`, then the same for the other entries, concatenated."""
     ends = np.cumsum(counts)
     if not len(ends):
         return np.zeros(0, np.int64)

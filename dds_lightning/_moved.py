@@ -4,9 +4,10 @@ import sys
 import warnings
 from collections.abc import Sequence
 from importlib import import_module
-from importlib.abc import Loader, MetaPathFinder
+from importlib.abc import InspectLoader, Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
-from types import ModuleType
+from importlib.util import find_spec
+from types import CodeType, ModuleType
 
 _DRAW = (
     *("bars", "charts", "clip", "curves", "dataset", "drawing", "gif"),
@@ -31,7 +32,7 @@ MOVED = {
     "dds_lightning.export": "dds_lightning.sharing.export",
     "dds_lightning.verification": "dds_lightning.sharing.verify",
     "dds_lightning.envs.adapters": "dds_lightning.tasks.env",
-    "dds_lightning.tasks.layout": "dds_lightning.tasks.columns",
+    "dds_lightning.tasks.layout": "dds_lightning.tasks.bodies",
     "dds_lightning.training.fitting": "dds_lightning.training.stage_cli",
     "dds_lightning.callbacks.evaluation": "dds_lightning.callbacks.rollouts",
     "dds_lightning.study.baselines": "dds_lightning.baselines.behaviour_cloning",
@@ -46,8 +47,10 @@ MOVED = {
     "datamodules.resimulate": "datamodules.physics.resimulate",
     "datamodules.sources.states": "datamodules.physics.states",
     "datamodules.sources.recordings": "datamodules.sources.rows",
-    "datamodules.signature": "datamodules.sources",
+    "datamodules.signature": "datamodules.sources.stat_hash",
     "datamodules.sources.belonging": "datamodules.sources.plausibility",
+    "datamodules.behaviours.train": "datamodules.behaviours.training.train",
+    "datamodules.behaviours.publish": "datamodules.behaviours.training.publish",
     "dds_lightning.optim": "dds_lightning.module",
     **{f"dds_lightning.interpret.{name}": f"dds_lightning.interpret.draw.{name}" for name in _DRAW},
     **{f"dds_lightning.interpret.{name}": f"dds_lightning.interpret.measure.{name}" for name in _MEASURE},
@@ -68,6 +71,13 @@ class _Redirect(MetaPathFinder, Loader):
         old = module.__name__
         warnings.warn(f"{old} has moved to {MOVED[old]}", DeprecationWarning, stacklevel=2)
         sys.modules[old] = import_module(MOVED[old])
+
+    def get_code(self, fullname: str) -> CodeType | None:
+        """The code of the new file, for `python -m OLD.PATH`."""
+        spec = find_spec(MOVED[fullname])
+        assert spec is not None
+        assert isinstance(spec.loader, InspectLoader)
+        return spec.loader.get_code(spec.name)
 
 
 def redirect_old_paths() -> None:

@@ -35,21 +35,21 @@ class DDSAgent(nn.Module):
     action = agent.act(observation)  # in the environment's units, inside its box
     ```
 
-    The agent draws from a random stream of its own: the same seed gives the same actions, and the global
-    streams stay untouched. Networks are put in evaluation mode and used where they are; nothing is copied.
+    The agent has its own random stream: the same seed gives the same actions, and the global streams stay
+    untouched. Networks are put in evaluation mode and used where they are; nothing is copied.
 
     Args:
-        skill: decoder and codebook.
-        policy: chooses codes; None for an agent whose `selection` is `random` or `fixed`.
+        skill: Decoder and codebook.
+        policy: Chooses codes; None for an agent whose `selection` is `random` or `fixed`.
         selection: `sample` from the policy, `greedy` its likeliest code, `argmax_q` the critic's best
             supported code, `random` any code with equal chance, `fixed` the codes of `fixed_codes`.
-        temperature: divides the policy's logits before sampling.
-        noise_scale: factor on the decoder's noise; None takes the skill model's own setting.
-        fixed_codes: with `fixed`, environment e plays code `fixed_codes[e % len(fixed_codes)]`.
-        seed: of the random stream until `reset` is given one.
+        temperature: Divides the policy's logits before sampling.
+        noise_scale: Factor on the decoder's noise; None takes the skill model's setting.
+        fixed_codes: With `fixed`, environment e plays code `fixed_codes[e % len(fixed_codes)]`.
+        seed: Seed of the random stream until `reset` is given one.
 
     Raises:
-        UserError: the parts do not fit each other, or a setting is outside its range.
+        UserError: The parts do not fit each other, or a setting is outside its range.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class DDSAgent(nn.Module):
         """Put the parts together."""
         super().__init__()
         self.skill, self.policy = skill, policy
-        self.selection, self.temperature, self.noise_scale = selection, float(temperature), noise_scale
+        self.selection, self.temperature, self._noise_scale = selection, float(temperature), noise_scale
         self.horizon, self.num_skills = int(skill.horizon), int(skill.num_skills)
         self.observation_dim = int(skill.hparams["observation_dim"])
         self.action_dim = int(skill.hparams["action_dim"])
@@ -76,7 +76,7 @@ class DDSAgent(nn.Module):
         self._generator: torch.Generator | None = None
         self._codes = np.zeros(0, dtype=np.int64)  # (E,) code in use
         self._clock = np.zeros(0, dtype=np.int64)  # (E,) steps until the next choice
-        self._decided = np.zeros(0, dtype=bool)  # (E,) whether the last act chose anew
+        self._decided = np.zeros(0, dtype=bool)  # (E,) whether the last act chose a new one
 
     def _check(self) -> None:
         choices, codes, last = get_args(AgentSelection), self.fixed_codes, self.num_skills - 1
@@ -86,8 +86,8 @@ class DDSAgent(nn.Module):
             raise UserError(f"selection is '{self.selection}', expected one of {', '.join(choices)}")
         if self.temperature <= 0:
             raise UserError(f"temperature is {self.temperature}, expected more than 0 ('greedy' is the limit)")
-        if self.noise_scale is not None and self.noise_scale < 0:
-            raise UserError(f"noise_scale is {self.noise_scale}, expected 0 or more")
+        if self._noise_scale is not None and self._noise_scale < 0:
+            raise UserError(f"noise_scale is {self._noise_scale}, expected 0 or more")
         if self.policy is None and self.selection not in ("random", "fixed"):
             raise UserError(f"selection '{self.selection}' needs a policy; use 'random' or 'fixed' without")
         if (self.selection == "fixed") != (codes is not None):
@@ -98,28 +98,36 @@ class DDSAgent(nn.Module):
             for name in ("num_skills", "observation_dim"):
                 mine, other = self.skill.hparams[name], self.policy.hparams[name]
                 if mine != other:
-                    raise UserError(f"{name} is {mine} in the skill model and {other} in the policy: no pair")
+                    raise UserError(
+                        f"{name} is {mine} in the skill model and {other} in the policy: they do not belong together"
+                    )
             learnt_with = self.policy.hparams.get("skill_hash")
             if learnt_with and learnt_with != (found := self.skill.fingerprint()):
                 raise UserError(
                     f"the policy was trained on the codes of skill model {short(learnt_with)}, this one is "
-                    f"{short(found)}: no pair; give the skill checkpoint that the policy learnt with"
+                    f"{short(found)}: they do not belong together; give the skill checkpoint that the policy "
+                    "was trained with"
                 )
 
     # ---------------------------------------------------------------- acting
 
     def variant(self, selection: AgentSelection | None = None, **settings: Any) -> DDSAgent:
-        """An agent with other settings on the same networks, with clocks and random stream of its own.
+        """Return an agent with other settings on the same networks, with its own clocks and random stream.
 
         Args:
-            selection: as in the constructor; this agent's without it.
+            selection: As in the constructor; this agent's by default.
             **settings: `temperature`, `noise_scale`, `fixed_codes`, `seed`, as in the constructor.
         """
-        own: dict[str, Any] = {"selection": selection or self.selection, "temperature": self.temperature}
-        own |= {"noise_scale": self.noise_scale, "seed": self._seed}
-        if own["selection"] == "fixed":
-            own["fixed_codes"] = self.fixed_codes
-        return DDSAgent(self.skill, self.policy, **{**own, **settings})
+        given: dict[str, Any] = {"selection": selection or self.selection, "temperature": self.temperature}
+        given |= {"noise_scale": self._noise_scale, "seed": self._seed}
+        if given["selection"] == "fixed":
+            given["fixed_codes"] = self.fixed_codes
+        return DDSAgent(self.skill, self.policy, **{**given, **settings})
+
+    @property
+    def noise_scale(self) -> float:
+        """Factor on the decoder's noise: this agent's, or the skill model's where it was given none."""
+        return float(self.skill.hparams["noise_scale"] if self._noise_scale is None else self._noise_scale)
 
     @property
     def num_envs(self) -> int:
@@ -142,11 +150,11 @@ class DDSAgent(nn.Module):
         return next(self.skill.parameters()).device
 
     def reset(self, num_envs: int = 1, seed: int | None = None) -> None:
-        """Start all clocks anew.
+        """Restart all clocks.
 
         Args:
             num_envs: E.
-            seed: of the random stream; without one the stream goes on where it was, as in gymnasium.
+            seed: Seed of the random stream; by default the stream continues, as in gymnasium.
         """
         if num_envs < 1:
             raise UserError(f"num_envs is {num_envs}, expected at least 1")
@@ -167,33 +175,41 @@ class DDSAgent(nn.Module):
 
         Args:
             observations: (E, O), or (O,) for a single environment.
-            restarted: (E,) environments whose episode has just begun: their skill clock starts anew. Not
+            restarted: (E,) environments whose episode has just begun: their skill clock restarts. Not
                 needed right after `reset`.
-            rows: the environments that `observations` belong to, ascending, when some are left out.
+            rows: The environments that `observations` belong to, ascending, when some are left out.
 
         Returns:
             (E, A) float32, or (A,) for a single environment; the environment's units, inside its box.
 
         Raises:
-            UserError: shapes that do not fit.
+            UserError: Shapes do not fit.
         """
         batch = np.asarray(observations, dtype=np.float32)
         single, batch = batch.ndim == 1, np.atleast_2d(batch)
         if not self.num_envs:
             self.reset(len(batch) if rows is None else int(np.max(rows)) + 1)
         rows = np.arange(self.num_envs) if rows is None else np.asarray(rows)
-        if batch.ndim != 2 or batch.shape[1] != self.observation_dim:
-            raise UserError(
-                f"observations are {batch.shape}, expected ({len(rows)}, {self.observation_dim}): this agent "
-                "was trained on another environment, or the observations are not flat"
-            )
+        x = self.observe(batch)
         if len(batch) != len(rows):
             raise UserError(f"{len(batch)} observations for {len(rows)} environments: reset({len(batch)}) first")
         if restarted is not None and np.shape(restarted) != rows.shape:
             raise UserError(f"restarted is {np.shape(restarted)}, expected ({len(rows)},)")
-        x = torch.from_numpy(np.ascontiguousarray(batch)).to(self.device)
         actions = self.decode(x, self.choose(x, restarted, rows))
         return actions[0] if single else actions
+
+    def observe(self, observations: NDArray[np.float32]) -> Tensor:
+        """Move observations (n, O) to the networks' device.
+
+        Raises:
+            UserError: They have another shape.
+        """
+        if observations.ndim != 2 or observations.shape[1] != self.observation_dim:
+            raise UserError(
+                f"observations are {observations.shape}, expected ({len(observations)}, {self.observation_dim}): this "
+                "agent was trained on another environment, or the observations are not flat"
+            )
+        return torch.from_numpy(np.ascontiguousarray(observations)).to(self.device)
 
     def choose(
         self, observations: Tensor, restarted: NDArray[np.bool_] | None, rows: NDArray[np.intp]
@@ -246,13 +262,13 @@ class DDSAgent(nn.Module):
     @property
     def group_key(self) -> tuple[int, float | None]:
         """Agents with equal keys can act in one decoder batch, see `actors.AgentGroup`."""
-        return id(self.skill), self.noise_scale
+        return id(self.skill), self._noise_scale
 
     # ---------------------------------------------------------------- files
 
     @torch.inference_mode()
     def golden(self) -> dict[str, list[list[float]]]:
-        """What the networks answer to fixed questions, kept with published weights to recognise them by.
+        """Return the networks' answers to fixed questions, stored with published weights to recognise them by.
 
         Returns:
             `actions` (8, A) for fixed states, codes and noise, and, with a policy, its `logits` (8, K; 0 where the
@@ -281,16 +297,16 @@ class DDSAgent(nn.Module):
         """Publish the agent as a directory that `load` reads, atomically.
 
         Args:
-            directory: where; an earlier published directory there is replaced.
-            metrics: scores to keep beside the weights.
-            card: text of the README.md; a short one is written without it.
-            **about: plain facts for config.yaml, for example `task="pointmaze-large-diverse"`.
+            directory: Where to write; an earlier published directory there is replaced.
+            metrics: Scores to keep beside the weights.
+            card: Text of README.md; a short one by default.
+            **about: Plain facts for config.yaml, for example `task="pointmaze-large-diverse"`.
 
         Returns:
             The directory.
 
         Raises:
-            UserError: the directory holds something that was not published.
+            UserError: The directory holds something that was not published.
         """
         from dds_lightning.saving.published import publish
 
@@ -298,7 +314,7 @@ class DDSAgent(nn.Module):
         if self.policy is not None:
             modules["policy"] = self.policy
         acting: dict[str, Any] = {"selection": self.selection, "temperature": self.temperature}
-        acting["noise_scale"] = self.noise_scale
+        acting["noise_scale"] = self._noise_scale  # null goes on meaning the skill model's
         acting["fixed_codes"] = None if self.fixed_codes is None else self.fixed_codes.tolist()
         return publish(directory, modules, {**about, "agent": acting, "golden": self.golden()}, metrics, card)
 
@@ -307,11 +323,11 @@ class DDSAgent(nn.Module):
         """Load a published agent, without its data set, on the CPU.
 
         Args:
-            directory: as written by `save` or `dds run`, or `hf:OWNER/NAME` on the hub.
-            **settings: override `selection`, `temperature`, `noise_scale`, `fixed_codes`, `seed`.
+            directory: As written by `save` or `dds run`, or `hf:OWNER/NAME` on the Hub.
+            **settings: Override `selection`, `temperature`, `noise_scale`, `fixed_codes`, `seed`.
 
         Raises:
-            UserError: files are missing, changed, of a newer version, or do not fit; the message names them.
+            UserError: Files are missing, changed, of a newer version, or do not fit; the message names them.
         """
         from dds_lightning.policy import PolicyModule
         from dds_lightning.saving.hub import is_hub, pull
@@ -330,3 +346,5 @@ class DDSAgent(nn.Module):
             return cls(skill, policy, **acting)
         except TypeError as error:
             raise UserError(f"{directory}: an agent setting that this version does not know: {error}") from None
+        except UserError as error:
+            raise error if settings else UserError(f"{directory}: {error}") from None  # the caller's may be to blame

@@ -1,17 +1,17 @@
 """Fine-tuning: start from the weights of a checkpoint, train some parts of them, each at its own rate.
 
 `init_from` starts a *new* training from weights; continuing an old one exactly is Lightning's `ckpt_path`, and the
-two never mix. The starting checkpoint is read when the module is made and is no part of its settings: what the
-training saves loads without it, and resumes without it.
+two never mix. The starting checkpoint is read when the module is created and is not one of its settings:
+what the training saves loads and resumes without it.
 
 - Settings that shape the network must be the checkpoint's (`SHAPE` of each module); the command line takes those that
   are not given from it. Observations and actions may have other dimensions: then only what fits is loaded, and a
   warning lists what was not.
-- The statistics of observations and actions are the checkpoint's if all of them fit, otherwise the new data's. Ask for
-  the new data's with `refit_normaliser`.
+- The statistics of observations and actions are the checkpoint's if all of them fit, otherwise the new data's;
+  `refit_normaliser` always takes the new data's.
 - Parts that are not `trainable` do not change by a bit: no gradient, no dropout, no running averages, no restart of
-  dead codes. A frozen part that does not fit is refused: it would stay random.
-- What a policy keeps of its data beside that, support of the codes and range of values, is always the new data's.
+  dead codes. A frozen part that does not fit is refused, because it would stay random.
+- The other statistics of a policy, support of the codes and range of values, are always the new data's.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ STATISTICS = ("normaliser.", "action_box.")
 
 
 def read(cls: type[StageModule], path: str) -> StageModule:
-    """The module in a checkpoint, read without running anything; the random streams stay where they are.
+    """Read the module in a checkpoint without running code from it; the random streams stay untouched.
 
     Raises:
-        UserError: it is missing, damaged, or of another kind.
+        UserError: The checkpoint is missing, damaged, or of another kind.
     """
     try:
         with torch.random.fork_rng(devices=[]):
@@ -51,10 +51,10 @@ def read(cls: type[StageModule], path: str) -> StageModule:
 
 
 def start_from(module: StageModule, path: str) -> None:
-    """Load everything that fits from the checkpoint at `path`, and warn of what does not.
+    """Load everything that fits from the checkpoint at `path`, and warn about what does not.
 
     Raises:
-        UserError: the checkpoint is missing, damaged, of another kind or of another shape, or a frozen part of
+        UserError: The checkpoint is missing, damaged, of another kind or of another shape, or a frozen part of
             `module` does not fit it.
     """
     source = read(type(module), path)
@@ -62,55 +62,57 @@ def start_from(module: StageModule, path: str) -> None:
         raise UserError(f"model.init_from: {path} was saved before its training began: give a trained checkpoint")
     refuse_other_shape(module, source, path)
     refuse_other_skills(module, source, path)
-    own, theirs = module.state_dict(), source.state_dict()
-    if "bottleneck.ema_sum" in own and "bottleneck.ema_sum" not in theirs:
-        # Running averages begin at the vectors, or the first step would throw them back to random ones.
+    ours, theirs = module.state_dict(), source.state_dict()
+    if "bottleneck.ema_sum" in ours and "bottleneck.ema_sum" not in theirs:
+        # Running averages begin at the vectors, or the first step would reset those to random ones.
         theirs["bottleneck.ema_sum"] = theirs["bottleneck.vectors"].clone()
-        theirs["bottleneck.ema_count"] = torch.ones_like(own["bottleneck.ema_count"])
-    misfits = [name for name, value in own.items() if name not in theirs or theirs[name].shape != value.shape]
-    left = {name for name in own if name in module.OF_DATA}
+        theirs["bottleneck.ema_count"] = torch.ones_like(ours["bottleneck.ema_count"])
+    misfits = [name for name, value in ours.items() if name not in theirs or theirs[name].shape != value.shape]
+    left = {name for name in ours if name in module.OF_DATA}
     if module.hparams.get("refit_normaliser") or any(name.startswith(STATISTICS) for name in misfits):
-        left |= {name for name in own if name.startswith(STATISTICS)}
+        left |= {name for name in ours if name.startswith(STATISTICS)}
     frozen = tuple(f"{name}." for name in module.frozen_modules)
     _refuse_random(module, [name for name in misfits if name.startswith(frozen)], path)
-    used = [name for name in module.frozen_modules if name != "bottleneck"]  # codes are no observations
+    used = [name for name in module.frozen_modules if name != "bottleneck"]  # codes do not depend on statistics
     if used and module.hparams.get("refit_normaliser"):
         raise UserError(
             f"model.refit_normaliser is True, but what is frozen ({', '.join(used)}) expects the statistics it was "
             "trained with: leave it false, or train all of it"
         )
-    loaded = {name: theirs[name] for name in own if name not in left and name not in misfits}
+    loaded = {name: theirs[name] for name in ours if name not in left and name not in misfits}
     for name, value in loaded.items():
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
             raise UserError(f"model.init_from: {path} holds numbers in {name} that are not finite: take an earlier one")
     module.load_state_dict(loaded, strict=False)
-    log.info("started from %s: %d of %d tensors", path, len(loaded), len(own))
+    log.info("started from %s: %d of %d tensors", path, len(loaded), len(ours))
     if misfits:
-        listed = "; ".join(f"{name} {_shapes(theirs.get(name), own[name])}" for name in misfits)
+        listed = "; ".join(f"{name} {_shapes(theirs.get(name), ours[name])}" for name in misfits)
         warnings.warn(
-            f"model.init_from: {path} fits in {len(loaded)} of {len(own)} tensors; these start anew (shape there, "
+            f"model.init_from: {path} fits in {len(loaded)} of {len(ours)} tensors; these start anew (shape there, "
             f"here): {listed}",
             stacklevel=2,
         )
 
 
 def refuse_other_shape(module: StageModule, source: StageModule, path: str) -> None:
-    """Name every setting that shapes the network and differs between the two."""
+    """Refuse a source whose network has another shape, naming every setting that differs."""
     there, here = dict(source.hparams), dict(module.hparams)
-    other = [name for name in module.SHAPE if _plain(there[name]) != _plain(here[name])]
-    if other:
-        found = ", ".join(f"model.{name} is {_plain(here[name])}" for name in other)
-        was = ", ".join(f"{_plain(there[name])}" for name in other)
+    differing = [name for name in module.SHAPE if _plain(there[name]) != _plain(here[name])]
+    if differing:
+        found = ", ".join(f"model.{name} is {_plain(here[name])}" for name in differing)
+        was = ", ".join(f"{_plain(there[name])}" for name in differing)
         remedy = " ".join(
-            f"--{'data' if name == 'horizon' else 'model'}.{name}={_plain(there[name])}" for name in other
+            f"--{'data' if name == 'horizon' else 'model'}.{name}={_plain(there[name])}" for name in differing
         )
-        if "num_skills" in other and module.STAGE == "policy":
+        if "num_skills" in differing and module.STAGE == "policy":
             remedy = "relabel with the skill model of that policy (data.skill)"
-        raise UserError(f"{found}, but model.init_from {path} was trained with {was}: give {remedy}, or start anew")
+        raise UserError(
+            f"{found}, but model.init_from {path} was trained with {was}: give {remedy}, or train from scratch"
+        )
 
 
 def refuse_other_skills(module: StageModule, source: StageModule, path: str) -> None:
-    """Refuse a policy that chose among the codes of another skill model: the same numbers mean other skills there."""
+    """Refuse a policy that chose among the codes of another skill model: there the same numbers mean other skills."""
     there, here = (one.hparams.get("skill_hash") for one in (source, module))
     if there and here and there != here:
         raise UserError(

@@ -29,7 +29,7 @@ def expectile(difference: Tensor, tau: float) -> Tensor:
 
     Args:
         difference: (B,) u = target Q - V.
-        tau: expectile in (0, 1); 0.5 is half the squared error.
+        tau: Expectile in (0, 1); 0.5 is half the squared error.
     """
     weight = torch.where(difference < 0, 1.0 - tau, tau)
     return (weight * difference.square()).mean()

@@ -1,19 +1,20 @@
-"""What every training stage's module shares: checked settings, parts that learn, and their optimiser."""
+"""What the modules of all training stages share: checked settings, trainable parts, and their optimiser."""
 
 import hashlib
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar, Literal, Self
 
 import lightning.pytorch as pl
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from dds_lightning.errors import UserError
-from dds_lightning.finetune import read, start_from
-from dds_lightning.nn.normaliser import Normaliser
+from dds_lightning.finetune import read, refuse_other_box, start_from
+from dds_lightning.nn.normaliser import ActionBox, Normaliser
 from dds_lightning.saving.checkpoint import STAGE_KEY, load_module
 
 Schedule = Literal["constant", "cosine"]
@@ -40,16 +41,25 @@ class StageModule(pl.LightningModule):
     """Buffers that always come from the data."""
 
     normaliser: Normaliser
+    action_box: ActionBox  # of modules that see actions
     init_from: str | None = None  # the checkpoint this module started from, in this process
+    terms: Mapping[str, Tensor] = MappingProxyType({})  # of the last training step; `FiniteGuard` names the bad ones
 
     def _refuse(self, rules: Sequence[tuple[str, bool, str]]) -> None:
-        """Refuse settings: (name, whether it is fine, what is expected)."""
+        """Refuse settings outside their range; `rules` are (name, whether the value is allowed, what is expected).
+
+        The rules that all stages share come after those.
+
+        Raises:
+            UserError: Names the first setting that is not allowed.
+        """
         h = self.hparams
         allowed = ", ".join(self.PARTS)
         named = self._named_parts
         parts = bool(named) and (named == ["all"] or set(named) <= set(self.PARTS))
         scales = h.get("lr_scale") or {}
         common = [
+            ("lr", h.lr > 0, "positive"),
             ("trainable", parts, f"all or some of {allowed}"),
             ("lr_scale", set(scales) <= set(self.PARTS), f"factors for some of {allowed}"),
             ("lr_scale", all(x > 0 for x in scales.values()), "positive factors: freeze parts with trainable"),
@@ -74,7 +84,7 @@ class StageModule(pl.LightningModule):
 
     @property
     def frozen_modules(self) -> tuple[str, ...]:
-        """Names of the submodules that do not; a Gaussian bottleneck has nothing to freeze and goes on drawing."""
+        """Names of the submodules that do not learn; a Gaussian bottleneck has no weights and keeps drawing."""
         names = (name for part in self.PARTS if part not in self.trained_parts for name in self.PARTS[part])
         return tuple(name for name in names if any(True for _ in getattr(self, name).parameters()))
 
@@ -82,45 +92,106 @@ class StageModule(pl.LightningModule):
         """Freeze what is not trained and load the weights to start from."""
         for name in self.frozen_modules:
             getattr(self, name).requires_grad_(False)
-        self.train(self.training)  # a Trainer leaves the modes as it finds them
+        self.train(self.training)  # a Trainer does not change modes
         if init_from is not None:
             self.init_from = str(init_from)
             start_from(self, self.init_from)
 
     def train(self, mode: bool = True) -> Self:
-        """Put frozen parts in evaluation mode always: dropout and running averages would move them."""
+        """Keep frozen parts in evaluation mode: dropout and running averages would change them."""
         super().train(mode)
         for name in self.frozen_modules:
             getattr(self, name).eval()
         return self
 
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
-        """One optimiser step and what belongs to it.
+        """Take one optimiser step and what belongs to it.
 
-        Not in `on_train_batch_end`: callbacks come before the module there, and a checkpoint that one of them
-        writes would lack what follows the step.
+        Not in `on_train_batch_end`, where callbacks run before the module: a checkpoint written by one of them would
+        lack what follows the step.
         """
         super().optimizer_step(*args, **kwargs)
         self.after_step(self.global_step + 1)  # Lightning counts the step when this returns
 
     def after_step(self, step: int) -> None:
-        """Follow up on optimiser step `step`, counted from 1."""
+        """Update what depends on optimiser step `step`, counted from 1."""
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Say whose checkpoint it is."""
         checkpoint[STAGE_KEY] = self.STAGE
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """A training that goes on does not start from anything."""
+        """Forget `init_from`: a training that continues does not start from weights."""
         self.init_from = None
 
     def refuse_frozen_without_weights(self) -> None:
-        """Refuse to train part of a model whose rest nobody ever trained."""
+        """Refuse to train part of a model whose other parts were never trained."""
         if self.frozen_modules and self.init_from is None and not bool(self.normaliser.fitted):
             raise UserError(
-                f"model.trainable is {self.hparams.trainable}, but the rest has only random weights: give "
-                "--model.init_from=CHECKPOINT, or train all of it"
+                f"model.trainable is {self.hparams.trainable}, but the other parts have random weights: give "
+                "--model.init_from=CHECKPOINT, or train all parts"
             )
+
+    def data_statistics(self, names: Sequence[str], remedy: str) -> dict[str, Any]:
+        """Statistics of the training data, as the data module computes them.
+
+        Args:
+            names: Those that are needed; others are left out.
+            remedy: What to do where there are none, for the message.
+
+        Returns:
+            Name to value.
+
+        Raises:
+            UserError: The data module has no statistics, or lacks one of them.
+        """
+        datamodule: Any = getattr(self.trainer, "datamodule", None)
+        if not hasattr(datamodule, "statistics"):
+            raise UserError(f"the {self.STAGE} model has no observation statistics: {remedy} first")
+        statistics = datamodule.statistics()
+        if missing := [name for name in names if name not in statistics]:
+            raise UserError(f"{type(datamodule).__name__}.statistics() lacks {', '.join(missing)}: return these too")
+        return {name: statistics[name] for name in names}
+
+    def fit_units(self) -> None:
+        """Take the statistics of observations and actions from the data, unless a checkpoint brought them.
+
+        Raises:
+            UserError: There are none, or the data's actions have other bounds than those of the checkpoint.
+        """
+        if bool(self.normaliser.fitted):
+            refuse_other_box(self, getattr(self.trainer, "datamodule", None))
+            return
+        names = ("observation_mean", "observation_std", "action_low", "action_high")
+        remedy = "fit it with a SegmentDataModule, or call normaliser.fit(mean, std) and action_box.fit(low, high)"
+        mean, std, low, high = self.data_statistics(names, remedy).values()
+        self.normaliser.fit(mean, std)
+        self.action_box.fit(low, high)
+
+    def log_training(self, total: Tensor, more: Callable[[], Mapping[str, Tensor]] = dict) -> None:
+        """Log a training step's loss and terms, at the steps of `is_log_step`.
+
+        Args:
+            total: The loss.
+            more: Computes what else to log; not called at other steps.
+        """
+        if is_log_step(self):
+            log = {"loss": total.detach(), **self.terms, **more()}
+            self.log_dict({f"train/{name}": value for name, value in log.items()})
+
+    def evaluate(self, batch: dict[str, Tensor], stage: str) -> None:
+        """Log how the model does on a held-out batch; `stage` is the prefix of the names, ``val`` or ``test``."""
+        raise NotImplementedError(f"{type(self).__name__} has no `evaluate`: write one to validate or test it")
+
+    def validation_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
+        """Log how the model does on a held-out batch."""
+        with torch.random.fork_rng():  # the same noise every time: losses differ only by what was learnt
+            torch.manual_seed(batch_idx)
+            self.evaluate(batch, "val")
+
+    def test_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
+        """As `validation_step`."""
+        self.evaluate(batch, "test")
 
     def configure_optimizers(self) -> Any:
         """Adam over everything that learns together, with a learning rate for each part where `lr_scale` says so."""
@@ -128,14 +199,14 @@ class StageModule(pl.LightningModule):
         parameters: Any = self.parameters()
         if h.get("lr_scale"):
             parameters = [
-                {"params": own, "lr": h.lr * h.lr_scale.get(part, 1.0), "name": part}
+                {"params": learning, "lr": h.lr * h.lr_scale.get(part, 1.0), "name": part}
                 for part in self.trained_parts
-                if (own := [p for n in self.PARTS[part] for p in getattr(self, n).parameters() if p.requires_grad])
+                if (learning := [p for n in self.PARTS[part] for p in getattr(self, n).parameters() if p.requires_grad])
             ]
         return adam(parameters, h.lr, h.lr_schedule, h.get("warmup_steps", 0), self)
 
     def fingerprint(self) -> str:
-        """SHA-256 of all weights and buffers with their names: the same for the same model, wherever it lies."""
+        """SHA-256 of all weights and buffers with their names: the same for the same model, wherever it is stored."""
         digest = hashlib.sha256()
         for name, tensor in sorted(self.state_dict().items()):
             digest.update(name.encode())
@@ -144,18 +215,18 @@ class StageModule(pl.LightningModule):
 
     @classmethod
     def starting_from(cls, path: str | Path, **settings: Any) -> Self:
-        """A new training that starts from the weights of a checkpoint, with its settings where none are given.
+        """Start a new training from the weights of a checkpoint, with its settings where none are given.
 
         Args:
             path: `.ckpt` or published directory; the same as `init_from`.
-            **settings: arguments of the constructor. `trainable`, `lr_scale` and `refit_normaliser` are never the
-                checkpoint's: they say how that one was made.
+            **settings: Arguments of the constructor. `trainable`, `lr_scale` and `refit_normaliser` are never the
+                checkpoint's: they describe how that one was trained.
 
         Raises:
-            UserError: as from the constructor.
+            UserError: A setting or the checkpoint is not valid.
         """
-        anew = ("trainable", "lr_scale", "refit_normaliser")
-        trained = {name: value for name, value in read(cls, str(path)).hparams.items() if name not in anew}
+        fresh = ("trainable", "lr_scale", "refit_normaliser")
+        trained = {name: value for name, value in read(cls, str(path)).hparams.items() if name not in fresh}
         return cls(**{**trained, **settings, "init_from": str(path)})
 
     @classmethod
@@ -181,7 +252,7 @@ def adam(
     warmup_steps: int,
     module: pl.LightningModule,
 ) -> Any:
-    """Build Adam in the form Lightning expects, over parameters or over groups of them with rates of their own.
+    """Build Adam in the form Lightning expects, over parameters or groups of them with their own rates.
 
     Reads ``trainer.max_steps`` only: ``estimated_stepping_batches`` builds the loaders early and breaks resuming.
     """

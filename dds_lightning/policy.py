@@ -6,35 +6,44 @@
                                   pi(k | s) ◄─ exp(alpha (Q - V)) log pi(k | s)   equation 9
 ```
 
-One Adam minimises the sum of the losses: their parameters are disjoint and every target carries a stop-gradient, so
-the step is the same as three optimisers stepping at once. (The original IQL updates V, then policy, then Q, each on
-the networks just updated.)
+One Adam minimises the sum of the losses: parameters are disjoint and targets carry a stop-gradient, so its step equals
+those of three optimisers. (The original IQL updates V, the policy and Q in turn, each with the networks just updated.)
 
-Codes are few, so the policy that minimises equation 9 can also be written down, with beta the policy of the data:
+With so few codes, the policy that minimises equation 9 can also be written down, with beta the policy of the data:
 
 ```
  pi(k | s)  ~  beta(k | s) exp(alpha (Q(s, k) - V(s)))
 ```
 
-``awr: closed_form`` learns beta from all data alike and forms this product when it acts. Regression instead learns the
-product from samples of uneven weight, of which few count: in AntMaze-Large 4 % (`effective_sample_size`).
+``awr: closed_form`` learns beta from all data with equal weight and forms this product when it acts. Regression instead
+learns the product from samples of uneven weight, of which few count: in AntMaze-Large 4 % (`effective_sample_size`).
 """
 
 import warnings
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal, get_args
+from typing import ClassVar, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
 
 import dds_lightning.losses as losses
-from dds_lightning.errors import UserError
-from dds_lightning.module import StageModule, is_log_step
+from dds_lightning.module import StageModule
 from dds_lightning.nn.mlp import MLP, FourierFeatures
 from dds_lightning.nn.normaliser import Normaliser
 
 Selection = Literal["sample", "greedy", "argmax_q"]
 Solution = Literal["regression", "closed_form"]
+Loss = tuple[Tensor, dict[str, Tensor]]  # a scalar to minimise, and statistics to log beside it
+STATISTICS = ("observation_mean", "observation_std", "code_share", "reward_range", "max_discount")
+
+
+class Judged(NamedTuple):
+    """A batch of semi-MDP transitions, and what the networks say about its states and codes."""
+
+    batch: dict[str, Tensor]  # as in `PolicyModule`
+    features: Tensor  # (B, F) embedded observations
+    q: Tensor  # (B,) smaller target Q(s, k) of the code taken, without gradient
+    v: Tensor  # (B,) V(s)
 
 
 class PolicyModule(StageModule):
@@ -47,43 +56,43 @@ class PolicyModule(StageModule):
     Args:
         observation_dim: O, linked from the data on the command line.
         num_skills: K, linked from the data.
-        hidden_dims: widths of value, Q and policy networks.
-        layer_norm: normalise before each ReLU of value and Q networks.
-        fourier_features: frequencies given to value, Q and policy networks beside the observation; 0 for none. They
+        hidden_dims: Widths of value, Q and policy networks.
+        layer_norm: Normalise before each ReLU of value and Q networks.
+        fourier_features: Frequencies that value, Q and policy networks see beside the observation; 0 for none. They
             let a small network see a thin wall early (named departure from the paper).
-        fourier_scale: standard deviation of those frequencies.
-        fourier_seen: how many leading numbers of the observation they see; 0 for all. 2 on a robot with many joints
-            whose position comes first, lest a moving leg hide where it is.
-        tau: expectile of the value loss.
-        alpha: temperature of AWR; larger follows the critic more closely. One preset with the rewards' scale.
-        weight_clip: upper bound of the AWR weights; ``closed_form`` has no uneven weights and needs none.
+        fourier_scale: Standard deviation of those frequencies.
+        fourier_seen: How many leading numbers of the observation they see, for example 2 for a position that comes
+            before many joints: a moving leg must not hide where the robot is. 0 for all.
+        tau: Expectile of the value loss.
+        alpha: Temperature of AWR; larger follows the critic more closely. Choose it together with the reward scale.
+        weight_clip: Upper bound of the AWR weights; not used by ``closed_form``, whose weights are equal.
         awr: ``regression`` on the codes of the data (the paper), or ``closed_form``, the policy that the regression
-            would find with data without end (named departure from the paper). `alpha` then may change at any time.
-        beta_floor: with ``closed_form``, codes to which the policy of the data gives less than this in a state are
+            would find with infinite data (named departure from the paper); `alpha` may then change at any time.
+        beta_floor: With ``closed_form``, codes to which the policy of the data gives less than this in a state are
             not chosen there: their Q was hardly learnt.
-        target_ema: rate of the target network.
+        target_ema: Rate of the target network.
         extraction: ``after`` trains the critic for ``critic_steps``, then the policy on the frozen critic (the
             paper); ``joint`` trains them together.
-        critic_steps: steps of the critic with ``after``; the remaining steps up to ``max_steps`` go to the policy.
-        support: codes seen less often than this share of the data are never chosen.
+        critic_steps: Steps of the critic with ``after``; the remaining steps up to ``max_steps`` go to the policy.
+        support: Codes seen less often than this share of the data are never chosen.
         lr: Adam's learning rate.
         lr_schedule: ``constant`` (the paper) or ``cosine`` decay to zero at ``max_steps``.
-        warmup_steps: steps of linear warm-up.
+        warmup_steps: Steps of linear warm-up.
         init_from: ``.ckpt`` or published directory whose weights to start from (`dds_lightning.finetune`), for new
-            rewards or a new goal; ``data.skill`` must be the skill model that this policy learnt with.
+            rewards or a new goal; ``data.skill`` must be the skill model that this policy was trained with.
         trainable: ``all``, ``critic`` (V and Q) or ``actor``; the rest does not change by a bit.
-        lr_scale: factor on ``lr`` by part, such as ``{actor: 0.1}``; 1 for a part that is not named.
-        refit_normaliser: with ``init_from``, take the statistics of the new data, not the checkpoint's.
-        watch: look every so many steps whether the critic left the range that rewards and discounts allow.
-        skill_hash: fingerprint of the skill model whose codes these are, linked from the data; null if nobody knows.
+        lr_scale: Factor on ``lr`` by part, such as ``{actor: 0.1}``; 1 for a part that is not named.
+        refit_normaliser: With ``init_from``, take the statistics of the new data, not the checkpoint's.
+        watch: Steps between two checks whether the critic left the range that rewards and discounts allow.
+        skill_hash: Fingerprint of the skill model whose codes these are, linked from the data; null if unknown.
 
     Raises:
-        UserError: a setting outside its range; the message names it.
+        UserError: A setting is outside its range; the message names it.
     """
 
     STAGE = "policy"
     PARTS: ClassVar = {"critic": ("value", "critic", "target_critic"), "actor": ("actor",)}
-    # What `awr` is belongs to the weights: with `closed_form` the actor's are those of beta.
+    # `awr` belongs to the weights: with `closed_form` the actor is beta.
     SHAPE = ("num_skills", "hidden_dims", "layer_norm", "fourier_features", "fourier_scale", "fourier_seen", "awr")
     OF_DATA = ("support_mask", "value_range")
     support_mask: Tensor
@@ -120,7 +129,18 @@ class PolicyModule(StageModule):
         super().__init__()
         hidden_dims = list(hidden_dims)
         self.save_hyperparameters(ignore=["init_from"])
-        self._check_settings()
+        rules = [
+            ("num_skills", num_skills >= 2, "at least 2: with one code there is nothing to choose"),
+            ("fourier_seen", 0 <= fourier_seen <= observation_dim, f"in [0, {observation_dim}]"),
+            ("tau", 0 < tau < 1, "in (0, 1)"),
+            ("alpha", alpha >= 0, "0 or more"),
+            ("weight_clip", weight_clip > 0, "positive"),
+            ("awr", awr in get_args(Solution), " or ".join(get_args(Solution))),
+            ("beta_floor", 0 <= beta_floor < 1 / num_skills, f"in [0, 1/{num_skills})"),
+            ("target_ema", 0 < target_ema <= 1, "in (0, 1]"),
+            ("support", 0 <= support < 1 / num_skills, f"in [0, 1/{num_skills})"),
+        ]
+        self._refuse(rules)
         self.num_skills = num_skills
         self.normaliser = Normaliser(observation_dim)
         self.features: nn.Module = nn.Identity()
@@ -134,29 +154,10 @@ class PolicyModule(StageModule):
         self.target_critic.load_state_dict(self.critic.state_dict())
         self.target_critic.requires_grad_(False)
         self.actor = MLP(width, num_skills, hidden_dims)
-        self.terms: dict[str, Tensor] = {}  # of the last training step, for whoever asks what went wrong
-        # Which codes the data support, and what values its rewards and discounts allow; filled at the fit's start.
+        # Filled when a fit starts: which codes the data support, and which values rewards and discounts allow.
         self.register_buffer("support_mask", torch.ones(num_skills, dtype=torch.bool))
         self.register_buffer("value_range", torch.tensor([-torch.inf, torch.inf]))
         self._begin(init_from)
-
-    def _check_settings(self) -> None:
-        h = self.hparams
-        rules = [
-            ("num_skills", h.num_skills >= 2, "at least 2: with one code there is nothing to choose"),
-            ("fourier_seen", 0 <= h.fourier_seen <= h.observation_dim, f"in [0, {h.observation_dim}]"),
-            ("tau", 0 < h.tau < 1, "in (0, 1)"),
-            ("alpha", h.alpha >= 0, "0 or more"),
-            ("weight_clip", h.weight_clip > 0, "positive"),
-            ("awr", h.awr in get_args(Solution), " or ".join(get_args(Solution))),
-            ("beta_floor", 0 <= h.beta_floor < 1 / h.num_skills, f"in [0, 1/{h.num_skills})"),
-            ("target_ema", 0 < h.target_ema <= 1, "in (0, 1]"),
-            ("support", 0 <= h.support < 1 / h.num_skills, f"in [0, 1/{h.num_skills})"),
-            ("lr", h.lr > 0, "positive"),
-        ]
-        self._refuse(rules)
-
-    # ---------------------------------------------------------------- what it says about a state
 
     def embed(self, observations: Tensor) -> Tensor:
         """Normalise observations (B, O) and append Fourier features."""
@@ -167,8 +168,8 @@ class PolicyModule(StageModule):
         return self.value(self.embed(observations)).squeeze(-1)
 
     def q(self, observations: Tensor) -> Tensor:
-        """The lesser of the two target critics for every code: (B, O) to (B, K)."""
-        return self._ensemble(self.target_critic, self.embed(observations)).amin(dim=0)
+        """The smaller of the two target critics for every code: (B, O) to (B, K)."""
+        return self._target_q(self.embed(observations))
 
     def logits(self, observations: Tensor) -> Tensor:
         """Unnormalised log pi(k | s): (B, O) to (B, K); -inf for codes without support in the data."""
@@ -177,8 +178,7 @@ class PolicyModule(StageModule):
         if self.hparams.awr == "regression":
             return scores
         beta = scores.softmax(dim=-1)
-        q = self._ensemble(self.target_critic, features).amin(dim=0)
-        scores = scores + self.hparams.alpha * (q - self.value(features))
+        scores = scores + self.hparams.alpha * (self._target_q(features) - self.value(features))
         return scores.masked_fill(beta < self.hparams.beta_floor, -torch.inf)
 
     def codes(
@@ -193,8 +193,8 @@ class PolicyModule(StageModule):
         Args:
             observations: (B, O).
             selection: ``sample`` from pi, ``greedy`` argmax of pi, ``argmax_q`` of the target critic.
-            temperature: divides the logits before sampling; below 1 is nearer to greedy.
-            generator: random stream; the global one without it.
+            temperature: Divides the logits before sampling; below 1 is nearer to greedy.
+            generator: Random stream; the global one by default.
 
         Returns:
             (B,) int64, only codes that the data support.
@@ -207,103 +207,76 @@ class PolicyModule(StageModule):
         probabilities = (logits / temperature).softmax(dim=-1)
         return torch.multinomial(probabilities, 1, generator=generator).squeeze(-1)
 
-    @staticmethod
-    def _ensemble(critic: nn.Module, features: Tensor) -> Tensor:
-        """Both critics on the same features (B, F): (2, B, K)."""
-        return critic(features.expand(2, *features.shape))
-
-    # ---------------------------------------------------------------- losses
+    def _target_q(self, features: Tensor) -> Tensor:
+        """Features (B, F) to the smaller target Q of every code (B, K)."""
+        return self.target_critic(features.expand(2, *features.shape)).amin(dim=0)
 
     @property
-    def learns_critic(self) -> bool:
-        """Whether V and Q learn in this step."""
-        first = self.hparams.extraction == "joint" or self.global_step < self.hparams.critic_steps
-        return "critic" in self.trained_parts and (first or "actor" not in self.trained_parts)
+    def learning(self) -> tuple[str, ...]:
+        """The parts that learn in this step: with ``after`` first the critic, then the actor."""
+        parts = self.trained_parts
+        if self.hparams.extraction == "joint" or len(parts) == 1:
+            return parts
+        return ("critic",) if self.global_step < self.hparams.critic_steps else ("actor",)
 
-    @property
-    def learns_actor(self) -> bool:
-        """Whether the policy learns in this step."""
-        return "actor" in self.trained_parts and (self.hparams.extraction == "joint" or not self.learns_critic)
+    def value_loss(self, judged: Judged) -> Loss:
+        """Equation 6: V(s) as an expectile of the smaller target Q."""
+        return losses.expectile(judged.q - judged.v, self.hparams.tau), {}
 
-    def critic_loss(
-        self, features: Tensor, v: Tensor, target_q: Tensor, batch: dict[str, Tensor]
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Equations 6 to 8: expectile regression of V and TD error of both Q.
-
-        Args:
-            features: (B, F) of the states.
-            v: (B,) V(s), with gradient.
-            target_q: (B,) lesser target Q of the codes taken.
-            batch: the semi-MDP transitions.
-        """
-        value_loss = losses.expectile(target_q - v, self.hparams.tau)
+    def critic_loss(self, judged: Judged) -> Loss:
+        """Equation 8: TD error of both Q(s, k), summed."""
+        batch, features = judged.batch, judged.features
         with torch.no_grad():
             next_v = self.v(batch["next_observations"])
             target = losses.td_target(batch["rewards"], batch["discounts"], batch["dones"], next_v)
-        index = batch["codes"].expand(2, -1).unsqueeze(-1)  # (2, B, 1)
-        q = self._ensemble(self.critic, features).gather(-1, index).squeeze(-1)  # (2, B)
-        q_loss = losses.td(q, target)
-        return value_loss + q_loss, {"value_loss": value_loss, "q_loss": q_loss}
+        q = self.critic(features.expand(2, *features.shape))  # (2, B, K)
+        taken = batch["codes"].expand(2, -1).unsqueeze(-1)  # (2, B, 1)
+        return losses.td(q.gather(-1, taken).squeeze(-1), target), {}
 
-    def actor_loss(self, features: Tensor, advantages: Tensor, codes: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Equation 9: regression on the codes of the data, weighted by exp(alpha A); (B, F), (B,), (B,).
+    def actor_loss(self, judged: Judged) -> Loss:
+        """Equation 9: regression on the codes of the data, weighted by exp(alpha (Q - V)).
 
-        With ``closed_form`` all weigh alike: the actor learns the policy of the data.
+        With ``closed_form`` all weights are equal: the actor learns the policy of the data.
         """
-        h = self.hparams
-        log_pi = self.actor(features).log_softmax(dim=-1).gather(-1, codes[:, None]).squeeze(-1)
+        h, codes = self.hparams, judged.batch["codes"]
+        log_pi = self.actor(judged.features).log_softmax(dim=-1).gather(-1, codes[:, None]).squeeze(-1)  # (B,)
         if h.awr == "closed_form":
             return losses.awr(log_pi, torch.ones_like(log_pi)), {"clipped_share": log_pi.new_zeros(())}
-        weights = losses.awr_weights(advantages.detach(), h.alpha, h.weight_clip)
-        info = {
+        weights = losses.awr_weights((judged.q - judged.v).detach(), h.alpha, h.weight_clip)
+        statistics = {
             "clipped_share": (weights >= h.weight_clip).float().mean(),
             "effective_sample_size": losses.effective_sample_size(weights),
         }
-        return losses.awr(log_pi, weights), info
+        return losses.awr(log_pi, weights), statistics
 
-    def loss(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
-        """Sum of the losses that learn in this step, and its terms and statistics."""
+    def loss(self, batch: dict[str, Tensor]) -> Loss:
+        """Sum of the losses that learn in this step; its terms and their statistics, detached."""
         features = self.embed(batch["observations"])  # (B, F)
-        codes = batch["codes"]
         with torch.no_grad():
-            target_q = self._ensemble(self.target_critic, features).amin(dim=0)  # (B, K)
-            target_q = target_q.gather(-1, codes[:, None]).squeeze(-1)  # (B,)
-        with torch.set_grad_enabled(self.learns_critic and torch.is_grad_enabled()):
-            v = self.value(features).squeeze(-1)  # (B,)
+            q = self._target_q(features).gather(-1, batch["codes"][:, None]).squeeze(-1)  # (B,)
+        v = self.value(features).squeeze(-1)  # (B,)
+        judged = Judged(batch, features, q, v)
+        terms = {"value_loss": self.value_loss, "q_loss": self.critic_loss} if "critic" in self.learning else {}
+        if "actor" in self.learning:
+            terms["actor_loss"] = self.actor_loss
         total = features.new_zeros(())
-        info: dict[str, Tensor] = {
-            "v_mean": v.mean(),
-            "v_min": v.min(),
-            "v_max": v.max(),
-            "q_mean": target_q.mean(),
-        }
-        if self.learns_critic:
-            critic_loss, terms = self.critic_loss(features, v, target_q, batch)
-            total = total + critic_loss
-            info.update(terms)
-        if self.learns_actor:
-            actor_loss, terms = self.actor_loss(features, target_q - v, codes)
-            total = total + actor_loss
-            info.update(terms, actor_loss=actor_loss)
+        info = {"v_mean": v.mean(), "v_min": v.min(), "v_max": v.max(), "q_mean": q.mean()}
+        for name, term in terms.items():
+            value, statistics = term(judged)
+            total = total + value
+            info |= {**statistics, name: value}
         return total, {name: value.detach() for name, value in info.items()}
-
-    # ---------------------------------------------------------------- Lightning
 
     def on_fit_start(self) -> None:
         """Take statistics, code support and possible values from the relabelled data."""
         self.refuse_frozen_without_weights()
-        datamodule: Any = getattr(self.trainer, "datamodule", None)
-        kept: dict[str, Tensor] = {}
-        if bool(self.normaliser.fitted):
-            if self.init_from is None:
-                return
-            kept = {"observation_mean": self.normaliser.mean, "observation_std": self.normaliser.std}
-        if not hasattr(datamodule, "statistics"):
-            raise UserError(
-                "the policy has no statistics of the data: fit it with a RelabeledDataModule, or call "
-                "fit_statistics(...) first"
-            )
-        self.fit_statistics(**{**datamodule.statistics(), **kept})
+        fitted = bool(self.normaliser.fitted)
+        if fitted and self.init_from is None:
+            return  # this training continues
+        statistics = self.data_statistics(STATISTICS, "fit it with a RelabeledDataModule, or call fit_statistics(...)")
+        if fitted:  # by the checkpoint that it starts from
+            statistics |= {"observation_mean": self.normaliser.mean, "observation_std": self.normaliser.std}
+        self.fit_statistics(**statistics)
 
     def fit_statistics(
         self,
@@ -312,7 +285,6 @@ class PolicyModule(StageModule):
         code_share: Tensor,
         reward_range: tuple[float, float],
         max_discount: float,
-        **_: Any,
     ) -> None:
         """Set the normaliser, the mask of supported codes and the range in which values are possible.
 
@@ -320,8 +292,8 @@ class PolicyModule(StageModule):
             observation_mean: (O,).
             observation_std: (O,).
             code_share: (K,) share of each code in the data.
-            reward_range: least and greatest reward of a semi-MDP transition.
-            max_discount: greatest discount of a transition.
+            reward_range: Smallest and largest reward of a semi-MDP transition.
+            max_discount: Largest discount of a transition.
         """
         self.normaliser.fit(observation_mean, observation_std)
         self.support_mask.copy_(code_share >= max(self.hparams.support, 1e-12))
@@ -332,31 +304,30 @@ class PolicyModule(StageModule):
     def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """One optimiser step's loss."""
         total, self.terms = self.loss(batch)
-        if is_log_step(self):
-            log = {"loss": total.detach(), **self.terms}
-            self.log_dict({f"train/{name}": value for name, value in log.items()})
+        self.log_training(total)
         if self.global_step % self.hparams.watch == 0:
             self._watch(self.terms)
         return total
 
     def _watch(self, info: dict[str, Tensor]) -> None:
-        """Warn, in plain words, when the critic's values are no possible sums of rewards."""
+        """Warn when the critic's values cannot be sums of rewards, or when most AWR weights are clipped."""
         low, high = self.value_range.tolist()
-        least, greatest = info["v_min"].item(), info["v_max"].item()
+        least, most = info["v_min"].item(), info["v_max"].item()
         slack = 0.1 * (high - low) if high - low < float("inf") else float("inf")
-        if least < low - slack or greatest > high + slack:
-            warnings.warn(
-                f"step {self.global_step}: V runs from {least:.3g} to {greatest:.3g}, but the data's rewards and "
-                f"discounts allow only {low:.3g} to {high:.3g}: the critic diverges. Check that terminations are "
-                "in the data, scale the rewards down, or lower lr or tau.",
-                stacklevel=2,
-            )
-        if "clipped_share" in info and info["clipped_share"].item() > 0.5:
-            warnings.warn(
-                f"step {self.global_step}: {100 * info['clipped_share'].item():.0f} % of the AWR weights are clipped "
-                f"at {self.hparams.weight_clip:g}: the policy clones them all alike. Lower alpha or the reward scale.",
-                stacklevel=2,
-            )
+        clipped = info["clipped_share"].item() if "clipped_share" in info else 0.0
+        diverges = (
+            f"V runs from {least:.3g} to {most:.3g}, but the data's rewards and discounts allow only {low:.3g} to "
+            f"{high:.3g}: the critic diverges. Check that terminations are in the data, scale the rewards down, or "
+            "lower lr or tau."
+        )
+        clones = (
+            f"{100 * clipped:.0f} % of the AWR weights are clipped at {self.hparams.weight_clip:g}: the policy clones "
+            "them all alike. Lower alpha or the reward scale."
+        )
+        impossible = least < low - slack or most > high + slack
+        for wrong, message in ((impossible, diverges), (clipped > 0.5, clones)):
+            if wrong:
+                warnings.warn(f"step {self.global_step}: {message}", stacklevel=2)
 
     @torch.no_grad()
     def after_step(self, step: int) -> None:
@@ -366,15 +337,8 @@ class PolicyModule(StageModule):
         if "critic" in self.trained_parts:
             torch._foreach_lerp_(target, online, self.hparams.target_ema)
 
-    def validation_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
-        """Losses on held-out transitions."""
-        self._evaluate(batch, "val")
-
-    def test_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
-        """As `validation_step`."""
-        self._evaluate(batch, "test")
-
-    def _evaluate(self, batch: dict[str, Tensor], stage: str) -> None:
+    def evaluate(self, batch: dict[str, Tensor], stage: str) -> None:
+        """Log the losses on held-out transitions, and how the policy compares with the data."""
         _, info = self.loss(batch)
         log_pi = self.logits(batch["observations"]).log_softmax(dim=-1)
         info["code_accuracy"] = (log_pi.argmax(dim=-1) == batch["codes"]).float().mean()

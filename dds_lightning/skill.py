@@ -7,6 +7,7 @@
 ```
 """
 
+from collections.abc import Iterable
 from itertools import islice
 from typing import Any, ClassVar, Literal
 
@@ -15,17 +16,19 @@ from torch import Tensor
 from torchmetrics import MeanMetric
 
 from dds_lightning.errors import UserError
-from dds_lightning.finetune import refuse_other_box
-from dds_lightning.module import StageModule, is_log_step
-from dds_lightning.nn.codebook import Codebook, CodebookInit, Quantised
+from dds_lightning.module import StageModule
+from dds_lightning.nn.bottleneck import Bottleneck, Skill
+from dds_lightning.nn.codebook import Codebook, CodebookInit
 from dds_lightning.nn.diffusion import DiffusionDecoder, MLPDecoder, Sampler
 from dds_lightning.nn.encoder import ENCODERS
-from dds_lightning.nn.gaussian import GaussianBottleneck, GaussianSkill
+from dds_lightning.nn.gaussian import GaussianBottleneck
 from dds_lightning.nn.normaliser import ActionBox, Normaliser
 from dds_lightning.nn.usage import CodebookUsage
 
 START_BATCHES = 64
 """Batches whose encodings start the codebook by k-means."""
+BOTTLENECKS: dict[str, type[Bottleneck]] = {"vq": Codebook, "gaussian": GaussianBottleneck}
+Batch = dict[str, Tensor]
 
 
 class SkillModule(StageModule):
@@ -44,39 +47,39 @@ class SkillModule(StageModule):
         encoder: ``transformer`` (the paper) or ``gru`` of the same size.
         decoder: ``diffusion`` (the paper) or ``mlp``, the same backbone as a regressor.
         bottleneck: ``vq`` for discrete skills, ``gaussian`` for the continuous comparison.
-        hidden_dim: width of encoder and decoder.
-        encoder_layers: transformer or GRU layers.
-        encoder_heads: attention heads.
-        decoder_blocks: residual blocks of the decoder.
-        dropout: rate in encoder and decoder.
+        hidden_dim: Width of encoder and decoder.
+        encoder_layers: Transformer or GRU layers.
+        encoder_heads: Attention heads.
+        decoder_blocks: Residual blocks of the decoder.
+        dropout: Rate in encoder and decoder.
         diffusion_steps: T.
-        beta_min: start of the VP schedule.
-        beta_max: end of the VP schedule.
-        time_dim: width of the time embedding.
+        beta_min: Start of the VP schedule.
+        beta_max: End of the VP schedule.
+        time_dim: Width of the time embedding.
         sampler: ``ddpm`` or ``ddim``.
-        noise_scale: factor on the noise drawn while acting (1: the model's own distribution).
-        clip_actions: keep the predicted x0 in the action box while sampling.
-        reconstruction: ``sum`` over H and A as in equation 13, or ``mean``. It sets how the denoising loss weighs
-            against the codebook terms.
-        commitment: beta of equation 14.
-        kl_weight: weight of the KL term of the Gaussian bottleneck.
+        noise_scale: Factor on the noise drawn while acting (1: the model's own distribution).
+        clip_actions: Keep the predicted x0 in the action box while sampling.
+        reconstruction: ``sum`` over H and A as in equation 13, or ``mean``. It sets the weight of the denoising loss
+            relative to the codebook terms.
+        commitment: Beta of equation 14.
+        kl_weight: Weight of the KL term of the Gaussian bottleneck.
         codebook_init: ``kmeans`` of encodings before the first step, ``uniform`` in +-1/K (VQ-VAE), or ``normal``.
-        codebook_ema: decay of an EMA codebook; null trains the vectors by the codebook loss.
-        restart_threshold: a code used less than this share of 1/K is dead and restarts from the data; 0 never. With
-            ``init_from`` take 0 to keep a policy that learnt with the old codes: what the new data do not use would
+        codebook_ema: Decay of an EMA codebook; null trains the vectors by the codebook loss.
+        restart_threshold: A code used less than this share of 1/K is dead and restarts from the data; 0 never. With
+            ``init_from``, 0 keeps a policy that was trained on the old codes: codes that the new data do not use would
             restart too, and mean something else.
-        restart_every: steps between two looks for dead codes.
-        restart_until: share of the training after which no code is moved any more, so that decoding settles.
+        restart_every: Steps between two searches for dead codes.
+        restart_until: Share of the training after which no code moves any more, so that the decoder can settle.
         lr: Adam's learning rate.
         lr_schedule: ``constant`` (the paper) or ``cosine`` decay to zero at ``max_steps``.
-        warmup_steps: steps of linear warm-up.
+        warmup_steps: Steps of linear warm-up.
         init_from: ``.ckpt`` or published directory whose weights to start from (`dds_lightning.finetune`).
         trainable: ``all``, or some of ``encoder``, ``codebook`` and ``decoder``; the rest does not change by a bit.
-        lr_scale: factor on ``lr`` by part, such as ``{encoder: 0.1}``; 1 for a part that is not named.
-        refit_normaliser: with ``init_from``, take the statistics of the new data, not the checkpoint's.
+        lr_scale: Factor on ``lr`` by part, such as ``{encoder: 0.1}``; 1 for a part that is not named.
+        refit_normaliser: With ``init_from``, take the statistics of the new data, not the checkpoint's.
 
     Raises:
-        UserError: a setting outside its range; the message names it.
+        UserError: A setting is outside its range; the message names it.
     """
 
     STAGE = "skill"
@@ -125,24 +128,35 @@ class SkillModule(StageModule):
         refit_normaliser: bool = False,
     ) -> None:
         super().__init__()
+        only_codebook = trainable in ("codebook", ["codebook"])
         self.save_hyperparameters(ignore=["init_from"])
-        self._check_settings()
-        discrete = bottleneck == "vq"
-        self.horizon, self.num_skills, self.discrete = horizon, num_skills, discrete
+        rules = [
+            ("num_skills", num_skills >= 2, "at least 2: with one code the policy has nothing to choose"),
+            ("horizon", horizon >= 1, "at least 1"),
+            ("diffusion_steps", diffusion_steps >= 1, "at least 1"),
+            ("encoder_heads", hidden_dim % encoder_heads == 0, f"a divisor of hidden_dim={hidden_dim}"),
+            ("time_dim", time_dim % 2 == 0, "an even number: half sines, half cosines"),
+            ("noise_scale", noise_scale >= 0, "0 or more"),
+            ("dropout", 0 <= dropout < 1, "in [0, 1)"),
+            ("codebook_ema", codebook_ema is None or 0 < codebook_ema < 1, "null or in (0, 1)"),
+            ("trainable", not only_codebook or bottleneck == "vq", "all: a gaussian bottleneck has no codebook"),
+            ("trainable", not only_codebook or codebook_ema is None, "more, or codebook_ema: null to give it a loss"),
+        ]
+        self._refuse(rules)
+        space = BOTTLENECKS[bottleneck]
+        self.horizon, self.num_skills, self.discrete = horizon, num_skills, space.discrete
         self.normaliser = Normaliser(observation_dim)
         self.action_box = ActionBox(action_dim)
         self.encoder = ENCODERS[encoder](
             observation_dim + action_dim,
-            skill_dim if discrete else 2 * skill_dim,
+            space.widths * skill_dim,
             horizon,
             hidden_dim,
             encoder_layers,
             encoder_heads,
             dropout,
         )
-        self.bottleneck = (
-            Codebook(num_skills, skill_dim, codebook_init, codebook_ema) if discrete else GaussianBottleneck()
-        )
+        self.bottleneck = space.build(self.hparams)
         backbone = (observation_dim, action_dim, skill_dim, hidden_dim, decoder_blocks, dropout)
         self.decoder: DiffusionDecoder | MLPDecoder = (
             DiffusionDecoder(*backbone, diffusion_steps, beta_min, beta_max, time_dim, sampler, clip_actions)
@@ -151,48 +165,29 @@ class SkillModule(StageModule):
         )
         self.reconstruction_rmse = MeanMetric()
         self.usage = CodebookUsage(num_skills)
-        self.terms: dict[str, Tensor] = {}  # of the last training step, for whoever asks what went wrong
+        self._batch: Batch = {}  # of the step in progress: dead codes restart from it
         self._begin(init_from)
 
-    def _check_settings(self) -> None:
-        """Refuse settings with which nothing can be learnt."""
-        h = self.hparams
-        only_codebook = h.trainable in ("codebook", ["codebook"])
-        rules = [
-            ("num_skills", h.num_skills >= 2, "at least 2: with one code the policy has nothing to choose"),
-            ("horizon", h.horizon >= 1, "at least 1"),
-            ("diffusion_steps", h.diffusion_steps >= 1, "at least 1"),
-            ("encoder_heads", h.hidden_dim % h.encoder_heads == 0, f"a divisor of hidden_dim={h.hidden_dim}"),
-            ("time_dim", h.time_dim % 2 == 0, "an even number: half sines, half cosines"),
-            ("noise_scale", h.noise_scale >= 0, "0 or more"),
-            ("dropout", 0 <= h.dropout < 1, "in [0, 1)"),
-            ("codebook_ema", h.codebook_ema is None or 0 < h.codebook_ema < 1, "null or in (0, 1)"),
-            ("lr", h.lr > 0, "positive"),
-            ("trainable", not only_codebook or h.bottleneck == "vq", "all: a gaussian bottleneck has no codebook"),
-            ("trainable", not only_codebook or h.codebook_ema is None, "more, or codebook_ema: null to give it a loss"),
-        ]
-        self._refuse(rules)
-
-    # ---------------------------------------------------------------- the method
-
-    def encode_segments(
-        self, observations: Tensor, actions: Tensor, lengths: Tensor | None = None
-    ) -> Quantised | GaussianSkill:
+    def encode_segments(self, observations: Tensor, actions: Tensor, lengths: Tensor | None = None) -> Skill:
         """Run encoder and bottleneck.
 
         Args:
             observations: (B, H, O) in the environment's units.
-            actions: (B, H, A) likewise.
+            actions: (B, H, A) in the environment's units.
             lengths: (B,) steps really taken, for segments cut short by a termination.
         """
-        sequence = torch.cat([self.normaliser(observations), self.action_box.to_unit(actions)], dim=-1)
-        return self.bottleneck(self.encoder(sequence, lengths))
+        return self.bottleneck(self._encodings(observations, actions, lengths))
 
-    def loss(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor], Quantised | GaussianSkill]:
+    def _encodings(self, observations: Tensor, actions: Tensor, lengths: Tensor | None = None) -> Tensor:
+        """Encoder outputs E(tau) of segments, as in `encode_segments`."""
+        sequence = torch.cat([self.normaliser(observations), self.action_box.to_unit(actions)], dim=-1)
+        return self.encoder(sequence, lengths)
+
+    def loss(self, batch: Batch) -> tuple[Tensor, dict[str, Tensor], Skill]:
         """Equation 14: denoising loss plus the terms of the bottleneck.
 
         Returns:
-            The scalar to minimise, its detached terms by name, and the skills of the batch.
+            The scalar to minimise, its detached terms by name (not weighted), and the skills of the batch.
         """
         observations, actions = batch["observations"], batch["actions"]  # (B, H, O), (B, H, A)
         horizon = actions.shape[1]
@@ -202,24 +197,25 @@ class SkillModule(StageModule):
             self.normaliser(observations).flatten(0, 1),  # (B H, O)
             skill.vectors.repeat_interleave(horizon, dim=0),  # (B H, D)
         )
-        denoising = error.mean()
+        total = error.mean()
         if self.hparams.reconstruction == "sum":
-            denoising = denoising * (horizon * actions.shape[-1])
-        if isinstance(skill, Quantised):
-            terms = {
-                "denoising": denoising,
-                "codebook": skill.codebook_loss,
-                "commitment": skill.commitment_loss,
-            }
-            total = denoising + skill.codebook_loss + self.hparams.commitment * skill.commitment_loss
-        else:
-            terms = {"denoising": denoising, "kl": skill.kl}
-            total = denoising + self.hparams.kl_weight * skill.kl
-        return total, {name: term.detach() for name, term in terms.items()}, skill
+            total = total * (horizon * actions.shape[-1])
+        terms = {"denoising": total.detach()}
+        for name, term in skill.terms.items():
+            total = total + term.weight * term.value
+            terms[name] = term.value.detach()
+        return total, terms, skill
 
     def encode(self, observations: Tensor, actions: Tensor, lengths: Tensor | None = None) -> Tensor:
-        """Code of each segment, k = argmin ||E(tau) - z_j||: shapes as in `encode_segments`, result (B,) int64."""
-        return self._discrete(self.encode_segments(observations, actions, lengths)).codes
+        """Code of each segment, k = argmin ||E(tau) - z_j||: shapes as in `encode_segments`, result (B,) int64.
+
+        Raises:
+            UserError: The skills are continuous.
+        """
+        codes = self.encode_segments(observations, actions, lengths).codes
+        if codes is None:
+            raise UserError("bottleneck is gaussian: its skills have no codes; train with bottleneck: vq")
+        return codes
 
     def decode(
         self,
@@ -229,8 +225,6 @@ class SkillModule(StageModule):
         generator: torch.Generator | None = None,
     ) -> Tensor:
         """Draw actions (B, A) for observations (B, O) under codes (B,)."""
-        if not isinstance(self.bottleneck, Codebook):
-            raise UserError("bottleneck is gaussian: there are no codes to decode, use decode_vectors")
         return self.decode_vectors(observations, self.bottleneck.lookup(codes), noise_scale, generator)
 
     def decode_vectors(
@@ -251,61 +245,40 @@ class SkillModule(StageModule):
 
     def decode_from(self, observations: Tensor, codes: Tensor, noise: Tensor) -> Tensor:
         """`decode` with given noise (N, B, A), the noise scale included: a function of its arguments."""
-        assert isinstance(self.bottleneck, Codebook), "codes belong to a codebook"
         vectors = self.bottleneck.lookup(codes)
         decoder: Any = self.decoder
         return self.action_box.from_unit(decoder.denoise(noise, self.normaliser(observations), vectors))
 
-    def _discrete(self, skill: Quantised | GaussianSkill) -> Quantised:
-        if not isinstance(skill, Quantised):
-            raise UserError("bottleneck is gaussian: its skills have no codes; train with bottleneck: vq")
-        return skill
-
-    # ---------------------------------------------------------------- Lightning
-
     def on_fit_start(self) -> None:
-        """Take the data's statistics and start the codebook, unless a checkpoint brought both."""
+        """Take the data's statistics and start the bottleneck, unless a checkpoint brought both."""
         self.refuse_frozen_without_weights()
-        datamodule: Any = getattr(self.trainer, "datamodule", None)
-        if bool(self.normaliser.fitted):
-            refuse_other_box(self, datamodule)
-        elif not hasattr(datamodule, "statistics"):
-            raise UserError(
-                "the skill model has no observation statistics: fit it with a SegmentDataModule, or call "
-                "normaliser.fit(mean, std) and action_box.fit(low, high) first"
-            )
-        else:
-            statistics = datamodule.statistics()
-            self.normaliser.fit(statistics["observation_mean"], statistics["observation_std"])
-            self.action_box.fit(statistics["action_low"], statistics["action_high"])
-        if isinstance(self.bottleneck, Codebook) and not bool(self.bottleneck.initted):
-            # A loader of its own: looking at the data must not move the training's place in it.
+        self.fit_units()
+
+        def first() -> Tensor:
+            # A separate loader: reading data here must not move the training's position.
+            datamodule: Any = getattr(self.trainer, "datamodule", None)
             loader: Any = datamodule.train_dataloader() if datamodule else self.trainer.train_dataloader
-            self.bottleneck.start_from(self._encodings(islice(iter(loader), START_BATCHES)))
+            return self._encodings_of(islice(iter(loader), START_BATCHES))
+
+        self.bottleneck.start(first)
 
     @torch.no_grad()
-    def _encodings(self, batches: Any) -> Tensor:
+    def _encodings_of(self, batches: Iterable[Batch]) -> Tensor:
         """Encoder outputs (N, D) of a few batches, in evaluation mode."""
         was_training = self.training
         self.eval()
-        outputs = []
-        for batch in batches:
-            observations, actions = (batch[name].to(self.device) for name in ("observations", "actions"))
-            units = [self.normaliser(observations), self.action_box.to_unit(actions)]
-            outputs.append(self.encoder(torch.cat(units, dim=-1)))
+        outputs = [
+            self._encodings(batch["observations"].to(self.device), batch["actions"].to(self.device))
+            for batch in batches
+        ]
         self.train(was_training)
         return torch.cat(outputs)
 
-    def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """One optimiser step's loss."""
         self._batch = batch
         total, self.terms, _ = self.loss(batch)
-        if is_log_step(self):
-            log = {"loss": total.detach(), **self.terms}
-            if isinstance(self.bottleneck, Codebook):
-                share = self.bottleneck.usage
-                log["perplexity"] = (-torch.special.xlogy(share, share).sum()).exp()
-            self.log_dict({f"train/{name}": value for name, value in log.items()})
+        self.log_training(total, self.bottleneck.health)
         return total
 
     def after_step(self, step: int) -> None:
@@ -313,28 +286,19 @@ class SkillModule(StageModule):
         h = self.hparams
         if h.restart_threshold <= 0 or step % h.restart_every or "codebook" not in self.trained_parts:
             return
-        settled = self.trainer.max_steps > 0 and step > h.restart_until * self.trainer.max_steps
-        if settled or not isinstance(self.bottleneck, Codebook):
+        if self.trainer.max_steps > 0 and step > h.restart_until * self.trainer.max_steps:
             return
         generator = torch.Generator().manual_seed(step)
-        moved = self.bottleneck.restart_dead(self._encodings([self._batch]), h.restart_threshold, generator)
+        moved = self.bottleneck.revive(lambda: self._encodings_of([self._batch]), h.restart_threshold, generator)
         optimizer: Any = self.optimizers()
-        state = optimizer.state.get(self.bottleneck.vectors, {})
-        for name in ("exp_avg", "exp_avg_sq"):  # the moments belonged to the code that died
-            if name in state:
-                state[name][moved] = 0.0
+        for parameter, rows in moved.items():
+            state = optimizer.state.get(parameter, {})
+            for name in ("exp_avg", "exp_avg_sq"):  # the moments belonged to the code that died
+                if name in state:
+                    state[name][rows] = 0.0
 
-    def validation_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
-        """Denoising loss, reconstruction error in action units (by sampling) and codebook usage."""
-        with torch.random.fork_rng():  # the same noise at every validation: losses differ by what was learnt alone
-            torch.manual_seed(batch_idx)
-            self._evaluate(batch, "val")
-
-    def test_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
-        """As `validation_step`."""
-        self._evaluate(batch, "test")
-
-    def _evaluate(self, batch: dict[str, Tensor], stage: str) -> None:
+    def evaluate(self, batch: Batch, stage: str) -> None:
+        """Log the loss, and update reconstruction error in action units (by sampling) and codebook usage."""
         total, terms, skill = self.loss(batch)
         observations, actions = batch["observations"], batch["actions"]
         horizon = actions.shape[1]
@@ -343,11 +307,11 @@ class SkillModule(StageModule):
         self.reconstruction_rmse.update((sampled - actions.flatten(0, 1)).square().mean(dim=-1))
         log = {f"{stage}/{name}": value for name, value in {"loss": total, **terms}.items()}
         self.log_dict(log, batch_size=len(actions))
-        if isinstance(skill, Quantised):
+        if skill.codes is not None:
             self.usage.update(skill.codes)
 
     def on_validation_epoch_start(self) -> None:
-        """Forget earlier epochs here: what `Trainer.validate` left are inference tensors, which no fit may change."""
+        """Reset the metrics here: `Trainer.validate` leaves inference tensors, which a fit must not change."""
         self.reconstruction_rmse.reset()
         self.usage.reset()
 

@@ -19,8 +19,8 @@
 # **Time:** less than half a minute on two CPU cores. No network, no GPU, no graphics driver.
 #
 # The task is **PointMaze-Large**: a ball is pushed with a force of two components through a maze, from the lower left
-# to the upper right. The agent has never practised. It learnt from logged drives between random places, hardly one of
-# which goes all the way, and it must stitch pieces of them together.
+# to the upper right. The agent has never practised in the maze. It learnt from logged drives between random places,
+# hardly any of which goes all the way, so it has to stitch pieces of them together.
 
 # %%
 # %matplotlib inline
@@ -60,8 +60,8 @@ print("action:     ", agent.act(observation).round(2), f"  by skill {agent.codes
 # 2. At every step the **decoder**, a small diffusion model, draws the action $a \sim p(a \mid z_k, s)$, where $z_k$ is
 #    the codebook's vector for skill $k$.
 #
-# So the policy makes few, large decisions, and the decoder fills in the movement. Here is the same by hand, for three
-# decisions:
+# So the policy makes few, large decisions, and the decoder fills in the movement. Here is the same loop by hand, for
+# three decisions:
 
 # %%
 env = task.make_env()
@@ -79,8 +79,8 @@ pd.DataFrame(decisions).round(2)
 # ## Let it play
 #
 # `rollout` plays many episodes side by side. Every contestant gets the same starts, so the comparison is fair.
-# `agent.variant("random")` shares the networks, but chooses skills by a roll of the dice: it shows what the policy adds
-# to the skills.
+# `agent.variant("random")` shares the networks but picks skills at random: the difference shows what the policy adds to
+# the skills.
 
 # %%
 contestants = [
@@ -94,8 +94,8 @@ table[["episodes", "success", "score", "length_success"]].rename(
 ).round(1)
 
 # %% [markdown]
-# The normalised score is $100 \cdot (R - R_{min}) / (R_{max} - R_{min})$. Reaching the goal is worth 1 here and
-# anything else 0, so the score is the share of episodes that get there. A failed episode ends after 800 steps.
+# The normalised score is $100 \cdot (R - R_{min}) / (R_{max} - R_{min})$. Here the return is 1 for reaching the goal
+# and 0 otherwise, so the score is the share of episodes that reach it. A failed episode ends after 800 steps.
 #
 # ## One episode as a clip
 #
@@ -109,8 +109,8 @@ Image(data=clip.read_bytes(), format="png")  # a GIF all the same: pages that kn
 # %% [markdown]
 # ## Its paths, coloured by skill
 #
-# Long stretches alternate between a few skills; which ones changes at the corners. This is the *stitching* of figure 4
-# (d and h) in the paper.
+# Long stretches alternate between a few skills, and the set of skills changes at the corners. This is the *stitching*
+# of figure 4 (d and h) in the paper.
 
 # %%
 plot_trajectories(task, result, "the agent")
@@ -124,8 +124,8 @@ plot_trajectories(task, result, "random skills", numbered=0)
 # %% [markdown]
 # ## What you should see
 #
-# The numbers below hold with some tolerance: arithmetic differs a little from machine to machine, and 20 episodes are
-# few.
+# The numbers below allow some tolerance: floating-point results differ a little from machine to machine, and 20
+# episodes are few.
 
 # %% tags=["check"]
 measured = table.loc[["the agent", "random skills"], "success"]

@@ -13,9 +13,9 @@
 # %% [markdown]
 # # 01 · Environments and data
 #
-# **What you will see:** a maze and its physics, a look at the other bodies (an ant that walks, a runner that falls, a
-# kitchen), 20,000 steps of data collected on the spot, where those drives went, how they are cut into segments, and
-# what happens to data that are broken: they are refused, with a sentence that says what is wrong and where.
+# **What you will see:** a maze and its physics, a look at the other environments (an ant that walks, a runner that
+# falls, a kitchen), 20,000 steps of data collected on the spot, where those drives went, how they are cut into
+# segments, and what happens to broken data: they are refused, with a sentence that says what is wrong and where.
 #
 # **Time:** less than half a minute on two CPU cores. No network, no GPU, no graphics driver.
 
@@ -38,7 +38,8 @@ from dds_lightning.interpret.draw.drawing import draw_starts, draw_trail, draw_w
 from dds_lightning.interpret.draw.gif import Still, gif_bytes
 from dds_lightning.interpret.draw.palette import WALL
 from dds_lightning.interpret.measure.body import body_frames
-from dds_lightning.interpret.measure.replay import body_states, simulator
+from dds_lightning.interpret.measure.replay import simulator
+from dds_lightning.interpret.measure.states import body_states
 from dds_lightning.tasks import task_table
 
 # %% tags=["parameters"] quick={"STEPS": 3000, "ANT_STEPS": 30}
@@ -79,9 +80,9 @@ pd.DataFrame(rows, columns=["step", "x (m)", "y (m)", "vx (m/s)", "vy (m/s)"]).r
 # %% [markdown]
 # ## The others
 #
-# The method is not about mazes. What a body is like is in the same table of tasks: how many numbers an observation and
-# an action have (O/A), how many steps an episode, what a score of 0 and 100 means. Several tasks share an environment
-# and differ in their data (`dds tasks` lists them all):
+# The method is not limited to mazes. The table of tasks describes every environment in the same way: how many numbers
+# an observation and an action have (O/A), how many steps an episode lasts, and what scores of 0 and 100 mean. Several
+# tasks share an environment and differ in their data (`dds tasks` lists them all):
 
 # %%
 tasks = task_table()
@@ -90,11 +91,11 @@ environments.insert(0, "tasks", tasks["environment"].value_counts())
 environments[["family", "tasks", "O/A", "steps", "episodes", "score range"]]
 
 # %% [markdown]
-# Three of them, drawn from the simulator's own model. The **ant** has four legs of two joints each and must learn to
-# walk before it can learn where to go. It is shown every two seconds, on its way through AntMaze-UMaze. The **hopper**
+# Three of them, drawn from the simulator's own model. The **ant** has four legs with two joints each and must learn to
+# walk before it can learn where to go. It is shown every two seconds on its way through AntMaze-UMaze. The **hopper**
 # has one leg. Here it gets random torques, and as soon as it leans too far the episode terminates, a fifth of a second
-# after it began: data of a runner are full of such ends. The **kitchen** has an arm of seven joints with a hand, and
-# four things to do, in any order.
+# after it began: a runner's data are full of such endings. The **kitchen** has an arm with seven joints and a hand, and
+# four subtasks to do in any order.
 
 # %%
 ant_task, hopper, kitchen = get_task("antmaze-umaze-diverse"), get_task("hopper-medium"), get_task("kitchen-mixed")
@@ -142,7 +143,7 @@ for ax, title in zip((left, middle, right), titles, strict=True):
 figure
 
 # %% [markdown]
-# The same walk as a clip. Nobody drew it: every limb is where the recorded observation says that it is.
+# The same walk as a clip. Nothing in it is animated by hand: every limb is where the recorded observation puts it.
 
 # %%
 figure = Figure(figsize=(4.2, 4.2), dpi=80, layout="constrained")
@@ -161,10 +162,10 @@ Image(data=clip, format="png")  # a GIF all the same: pages that know only "png"
 # %% [markdown]
 # ## Collect
 #
-# Back to the ball. Offline learning needs drives that somebody else made. Here a planner finds a way over the cells and
-# a controller follows it, always to **random goals**, never on purpose to ours. It is noisy on purpose too: it strays
-# from the middle of the way, has bursts of random pushes, and sometimes brakes and rests. Data without walls, dead ends
-# and rest would leave the learner guessing there, and it guesses too well of the unknown.
+# Back to the ball. Offline learning needs drives recorded by somebody else. Here a planner finds a path through the
+# cells and a controller follows it, always to **random goals**, never deliberately to ours. It is also deliberately
+# noisy: it strays from the middle of the path, makes bursts of random pushes, and sometimes brakes and rests. Without
+# walls, dead ends and rest in the data the learner would have to guess there, and it guesses too optimistically.
 
 # %%
 folder = collect_pointmaze(task, steps=STEPS, seed=0, out=RUNS, workers=1, overwrite=True, progress=False)
@@ -174,8 +175,7 @@ print(f"{recorded.num_steps:,} steps in {recorded.num_episodes} episodes, in the
 # %% [markdown]
 # ## Look at them
 #
-# Six episodes on the left, one colour each, and how often every place was visited on the right. What is white on the
-# right was never seen.
+# On the left six episodes, one colour each; on the right how often each place was visited. White means never.
 
 # %%
 figure = Figure(figsize=(9.5, 3.9), layout="constrained")
@@ -195,11 +195,11 @@ figure
 # %% [markdown]
 # ## The reward of our goal
 #
-# The drives had other goals, so what was recorded as reward is of no use. `load_trajectories` gives every step the
-# reward of *this* task: 1 on entering the goal circle, 0 elsewhere. The episode **terminates** there (there is nothing
-# left to earn), and what follows becomes an episode of its own. That a recording merely stopped is a **truncation**:
-# life would have gone on, and the learner may look beyond. Confusing the two is a classic mistake. (Steps that stay in
-# the circle after a success are left out.)
+# The drives had other goals, so their recorded rewards are of no use. `load_trajectories` gives every step the reward
+# of *this* task: 1 on entering the goal circle, 0 elsewhere. The episode **terminates** there (there is nothing left to
+# earn), and what follows becomes a separate episode. Where the recording merely stopped, we speak of a **truncation**:
+# the episode would have gone on, and the learner may look beyond it. Confusing the two is a classic mistake. (Steps
+# that stay in the circle after a success are left out.)
 
 # %%
 data = load_trajectories(f"local:{folder}", task)
@@ -239,7 +239,7 @@ figure
 # ## What a refusal looks like
 #
 # File formats accept almost anything, and a learner trained on broken data fails late and silently. So everything is
-# checked on the way in, and a refusal names data set, episode, field and value. Six ways to go wrong:
+# checked on the way in, and the error names the data set, episode, field and value. Six ways to go wrong:
 
 # %%
 good = data.episode(0)
@@ -321,10 +321,10 @@ checks.round(2)
 #
 # 1. Collect with `action_noise=0, burst_probability=0`. Which parts of the picture of visits become white, and what is
 #    the share of segments that start at less than 0.2 m/s?
-# 2. Collect `pointmaze-large-play` instead: its drives run between ten hand-picked cells. Draw them. How many reach our
+# 2. Collect `pointmaze-large-play` instead: its drives run between ten hand-picked cells. Plot them. How many reach our
 #    goal now?
-# 3. Bring your own: write two episodes as plain arrays and give them to `Trajectories.from_episodes`. Forget
-#    `terminations`; what does the refusal say?
+# 3. Bring your own: write two episodes as plain arrays and give them to `Trajectories.from_episodes`. Leave out
+#    `terminations`; what does the error say?
 #
 # ## The same at full size
 #

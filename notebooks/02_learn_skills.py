@@ -14,8 +14,8 @@
 # # 02 · Learn skills
 #
 # **What you will see:** what vector quantisation does to a cloud of points, a small skill model that learns eight
-# skills before your eyes with the health of its codebook beside the loss, the same training without care for the
-# codebook, and what the skills came to mean: every one of them replayed from eight starts.
+# skills before your eyes, with the health of its codebook next to the loss, the same training without any care for the
+# codebook, and what the skills came to mean: each of them replayed from eight starts.
 #
 # **Time:** about one minute on two CPU cores. No network, no GPU, no graphics driver.
 
@@ -61,8 +61,8 @@ RUNS = Path("../runs/notebooks/02")  # what this notebook writes lies here
 # $$k = \arg\min_j \lVert E(\tau) - z_j \rVert$$
 #
 # Here are 600 points in the plane, in eight clumps, and a codebook of eight vectors that starts by k-means. A colour is
-# a code, a numbered disc is its vector. The start need not be perfect (one vector may serve two clumps and another get
-# what is left); what counts is that every vector has points of its own.
+# a code, and a numbered disc is its vector. The start need not be perfect (one vector may serve two clumps and another
+# get what is left); what matters is that every vector has some points.
 
 # %%
 torch.manual_seed(0)
@@ -85,8 +85,8 @@ figure
 # "Nearest" has no gradient: a small move of a point changes nothing, until suddenly another code is nearer. Two tricks
 # make it trainable (equations 13 and 14):
 #
-# * **Straight through.** Forwards the decoder gets $z_k$; backwards its gradient is handed to $E(\tau)$ as if nothing
-#   had happened in between.
+# * **Straight through.** In the forward pass the decoder gets $z_k$; in the backward pass its gradient is handed to
+#   $E(\tau)$ as if nothing had happened in between.
 # * **Two pulls.** The codebook term $\lVert \mathrm{sg}[E(\tau)] - z_k \rVert^2$ pulls the vector to its points, the
 #   commitment term $\beta \lVert E(\tau) - \mathrm{sg}[z_k] \rVert^2$ pulls the points to their vector. ($\mathrm{sg}$
 #   stops the gradient.)
@@ -97,7 +97,7 @@ quantised = codebook(encoding)
 (quantised.vectors @ torch.tensor([3.0, -1.0])).sum().backward()  # a "decoder" whose gradient is (3, -1)
 print("what the decoder gets:    ", quantised.vectors.detach().numpy().round(2), "= vector", int(quantised.codes[0]))
 print("gradient at the encoding: ", encoding.grad.numpy(), "straight through")
-print(f"pulls: codebook {quantised.codebook_loss.item():.3f}, commitment {quantised.commitment_loss.item():.3f}")
+print(f"pulls: codebook {quantised.terms['codebook'].value:.3f}, commitment {quantised.terms['commitment'].value:.3f}")
 
 # %% [markdown]
 # ## The data
@@ -116,16 +116,17 @@ print({name: tuple(tensor.shape) for name, tensor in batch.items()})
 # %% [markdown]
 # ## Learn, and watch
 #
-# The whole model in one line: a transformer encodes, the codebook sorts, and a diffusion **decoder** must give back
-# every action of the segment from $z_k$ and the state alone. It never sees the other actions, so whatever they have in
-# common has to go through the code: that is why a code becomes a *skill*. The loss (equation 14) is
+# The whole model in one sentence: a transformer encodes a segment, the codebook assigns it a code, and a diffusion
+# **decoder** must reproduce every action of the segment from $z_k$ and the state alone. It never sees the other
+# actions, so whatever they have in common has to go through the code: that is why a code becomes a *skill*. The loss
+# (equation 14) is
 #
 # $$L = \underbrace{\lVert \epsilon - \epsilon_\theta(a_t, s, z_k, t) \rVert^2}_{\text{denoising}}
 #   + \underbrace{\lVert \mathrm{sg}[E] - z_k \rVert^2}_{\text{codebook}}
 #   + \beta \underbrace{\lVert E - \mathrm{sg}[z_k] \rVert^2}_{\text{commitment}}$$
 #
 # The picture below is redrawn while the model learns. On the right is the share of each code over the last few dozen
-# batches. *Perplexity* $e^{H}$ counts the codes that are really in use: eight when all are used alike, one after a
+# batches. *Perplexity* $e^{H}$ is the effective number of codes in use: eight when all are used equally, one after a
 # collapse.
 
 
@@ -203,9 +204,9 @@ pd.Series({**health, "rmse of guessing zero": guess}).round(3).to_frame("held-ou
 # %% [markdown]
 # ## The same without care
 #
-# Codebooks are known to **collapse**: a vector that is never nearest gets no pull, and so will never be nearest. Two
-# habits prevent it here: the codebook starts at the centres of the first encodings (k-means), and a dead code restarts
-# at a badly served point. Now without both, from random normal vectors:
+# Codebooks are known to **collapse**: a vector that is never the nearest gets no gradient, and so never becomes the
+# nearest. Two measures prevent it here: the codebook starts at the centres of the first encodings (k-means), and a dead
+# code is restarted at a point that is far from every vector. Now without either, from random normal vectors:
 
 # %%
 careless, _, careless_watch = learn(max(STEPS // 4, 1), codebook_init="normal", restart_threshold=0.0)
@@ -217,9 +218,10 @@ print(f"without care: {collapsed['val/codes_used']:.0f} of {SKILLS} codes in use
 # %% [markdown]
 # ## What do the codes mean?
 #
-# Give every segment its code, and look at what its ten steps did on average. Nobody told the model about directions: it
-# found that the push is what the actions of a segment have in common. On the left the codes tile the pushes, on the
-# right they are mixed: what the body was doing before is in the state, and the decoder sees that anyway.
+# Assign every segment its code, and look at what its ten steps did on average. The model was never given directions: it
+# discovered that the push is what the actions of a segment have in common. On the left the codes tile the space of
+# pushes; on the right they are mixed, because what the body was doing before is in the state, which the decoder sees
+# anyway.
 
 # %%
 labelled = relabel(data, model)
@@ -247,8 +249,9 @@ labelled.summary().drop(columns=["reward", "terminations"]).round(2)
 # ## Replay them
 #
 # Now the other way round: put the body at rest somewhere, hold one code, and let the decoder act for 50 steps. First
-# one panel a skill (as in figure 4 of the paper): the stars are eight starts. A skill does much the same from each of
-# them, until there is a wall. Some hardly move a body at rest: they are small corrections for one that is on its way.
+# one panel per skill (as in figure 4 of the paper); the stars mark the eight starts. A skill does much the same from
+# each of them, until it meets a wall. Some hardly move a body at rest: they are small corrections for one that is on
+# its way.
 
 # %%
 agent = DDSAgent(model, selection="random")
@@ -256,8 +259,8 @@ replays = replay_skills(task, agent, steps=REPLAY_STEPS)
 plot_starts_by_skill(task, **replays)
 
 # %% [markdown]
-# Then one panel a start, with all the skills: a star of directions to choose from. To choose well is the business of
-# the policy, in notebook 04.
+# Then one panel per start, with all the skills: a star of directions to choose from. Choosing well is the job of the
+# policy, in notebook 04.
 
 # %%
 plot_skills_by_start(task, **replays)
@@ -275,9 +278,9 @@ Image(data=clip, format="png")  # a GIF all the same: pages that know only "png"
 # %% [markdown]
 # ## What you should see
 #
-# "Explained by the code" is the share of the variance of the mean push that lies between the codes, not within them: 0
-# if codes had nothing to do with pushes, 1 if they said everything. With eight codes for two dimensions of push *and*
-# two of velocity it cannot be 1.
+# "Explained by the code" is the share of the variance of the mean push that lies between codes rather than within them:
+# 0 if the codes had nothing to do with pushes, 1 if they determined them. With eight codes for two dimensions of push
+# *and* two of velocity it cannot be 1.
 
 # %% tags=["check"]
 means = np.stack([mean_action[codes == k].mean(axis=0) if (codes == k).any() else np.zeros(2) for k in range(SKILLS)])
@@ -304,7 +307,7 @@ checks.round(2)
 #    anywhere; what are more of them good for?
 # 2. `learn(STEPS, decoder="mlp")` replaces diffusion by plain regression. Which one draws the same action twice in the
 #    same state? Compare the two on segments that begin at a junction.
-# 3. Bring only one of the two habits back (`codebook_init="kmeans"`, or `restart_threshold=0.1`). Which does more?
+# 3. Bring back only one of the two measures (`codebook_init="kmeans"`, or `restart_threshold=0.1`). Which does more?
 #
 # ## The same at full size
 #

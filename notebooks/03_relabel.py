@@ -13,14 +13,14 @@
 # %% [markdown]
 # # 03 · Relabel: from steps to skills
 #
-# **What you will see:** a drive cut into segments and recoloured by skill, one line of the table that the policy learns
-# from checked by hand, what two ways to discount make of a far goal, what each code does and what follows it, how
+# **What you will see:** a drive cut into segments and recoloured by skill, one row of the policy's training table
+# checked by hand, what two ways of discounting make of a distant goal, what each code does and what follows it, how
 # segments end, and two mistakes at the ends of recordings, one of which ruins everything.
 #
 # **Time:** about half a minute on two CPU cores. No network, no GPU, no graphics driver.
 #
 # Between learning skills (notebook 02) and learning when to use them (notebook 04) lies a step in which nothing is
-# learnt: the data are told again in a shorter language. It looks like bookkeeping, and decides what can be learnt at
+# learnt: the data are rewritten in terms of skills. It looks like bookkeeping, but it decides what can be learnt at
 # all.
 
 # %%
@@ -72,9 +72,9 @@ print(f"{data.num_steps:,} steps in {data.num_episodes} episodes: {reached.sum()
 # %% [markdown]
 # ## Cut and name
 #
-# The encoder of notebook 02 looks at a segment $\tau$ of ten states and actions, and the nearest vector of the codebook
-# gives it a name (equation 10): $k = \arg\min_j \lVert E(\tau) - z_j \rVert$. Here is the longest drive that enters the
-# goal, first as a sequence of steps, then, segment by segment, as a sequence of skills.
+# The encoder of notebook 02 maps a segment $\tau$ of ten states and actions to a point, and the nearest vector of the
+# codebook gives the segment its code (equation 10): $k = \arg\min_j \lVert E(\tau) - z_j \rVert$. Here is the longest
+# drive that enters the goal, first as a sequence of steps, then, segment by segment, as a sequence of skills.
 
 # %%
 segments = code_segments(skill, data)  # one every ten steps, so that they do not overlap
@@ -114,9 +114,9 @@ clip = recolouring()
 Image(data=clip, format="png")  # a GIF all the same: pages that know only "png" then play it too
 
 # %% [markdown]
-# ## One line of the table
+# ## One row of the table
 #
-# What remains of a segment is one line of a much shorter story (section 4.2): *in state $s_t$ skill $k$ was used, it
+# What remains of a segment is one row of a much shorter table (section 4.2): *in state $s_t$ skill $k$ was used, it
 # earned $R$ and led to $s_{t+h}$*, with
 #
 # $$R = \sum_{i=1}^{h} \gamma^{\,i-1}\, r_{t+i-1}$$
@@ -138,8 +138,8 @@ pd.DataFrame(
 
 # %% [markdown]
 # The last segment is shorter, because the goal ended it. Where a segment may begin is a choice: every ten steps
-# (`stride=10`, the paper's words), or at every step (`stride=1`), which tells the same drives in ten overlapping ways
-# and gives the learner ten times as many lines. From here on every step begins one:
+# (`stride=10`, as the paper says), or at every step (`stride=1`), which cuts the same drives in ten overlapping ways
+# and gives the learner ten times as many rows. From here on, a segment begins at every step:
 
 # %%
 table = relabel(data, skill, gamma=GAMMA, **convention)
@@ -163,10 +163,10 @@ print(f"{len(table):,} transitions; our own sums of rewards differ from theirs b
 # ## Two ways to discount
 #
 # How much does what comes *after* a skill count? The value of the next state is multiplied by a number, and there are
-# two honest choices:
+# two reasonable choices:
 #
-# * `per_skill`: by $\gamma$, once a decision. This is the formula of the paper (equation 8).
-# * `per_step`: by $\gamma^h$, once a step, as if there were no skills. Ten steps make $0.99^{10} = 0.904$.
+# * `per_skill`: by $\gamma$, once per decision. This is the paper's formula (equation 8).
+# * `per_step`: by $\gamma^h$, once per step, as if there were no skills. Ten steps make $0.99^{10} = 0.904$.
 #
 # It looks like a detail, but it decides how far a learner can see. Left: the value of a state that is $n$ skills away
 # from the goal. Right: how much better it is to be one skill nearer, which is all that a policy can go by.
@@ -196,7 +196,7 @@ figure
 #
 # ## What the codes stand for
 #
-# One row a code: how much of the data it covers, what it earns, how far the body moves under it, and how often it
+# One row per code: how much of the data it covers, what it earns, how far the body moves under it, and how often it
 # enters the goal.
 
 # %%
@@ -205,8 +205,8 @@ summary.set_index("code").round(2)
 
 # %% [markdown]
 # Mean displacements `dx`, `dy` are near zero although the body moves a third of a metre: *where it goes* in a tenth of
-# a second is decided by the speed that it already has, and a code is used at every speed. What a code stands for is a
-# *push*, the change of velocity. The discs on the right are the codes, each at its mean push: they form a wheel,
+# a second is determined by the velocity that it already has, and a code is used at every velocity. What a code stands
+# for is a *push*, a change of velocity. The discs on the right are the codes, each at its mean push: they form a wheel
 # with a hub of small corrections.
 
 # %%
@@ -229,9 +229,9 @@ figure
 # %% [markdown]
 # ## How long they last, and how they end
 #
-# Nearly all segments have ten steps. The few shorter ones end in the goal: a drive that enters it gives one segment
-# each of 1, 2, ... 9 and 10 steps that sees it happen (on the right: where they begin). They are less than one in a
-# hundred, and they are the *only* place where the table says that anything good ever happens.
+# Nearly all segments have ten steps. The few shorter ones end in the goal: a drive that enters it yields one segment
+# each of 1, 2, ... 9 and 10 steps that contains the arrival (on the right: where they begin). They are fewer than one
+# in a hundred, and they are the *only* rows that say that anything good ever happens.
 
 # %%
 figure = Figure(figsize=(9.5, 3.0), layout="constrained")
@@ -253,8 +253,8 @@ figure
 # %% [markdown]
 # ## What follows what
 #
-# With skills as words, a drive is a sentence. Row: the code of a segment; column: the code of the next one, in per
-# cent of the row. On the diagonal a push goes on, four times as often as by chance. A strong push is followed by a
+# If skills are words, a drive is a sentence. Row: the code of a segment; column: the code of the next one, in per cent
+# of the row. The diagonal is a push that continues, four times as often as by chance. A strong push is followed by a
 # weaker one in the same direction (15 by 7, 12 by 2, 8 by 3), and hardly ever by its opposite (15 by 10, 12 by 8).
 
 # %%
@@ -268,14 +268,14 @@ plot_transitions(follows)
 #
 # A recording ends for one of two reasons. It **terminates**: the goal is entered, nothing more can be earned, and the
 # learner must not look beyond (`goal` above; $V$ of the next state counts nothing). Or it is **truncated**: the
-# recording merely stopped, and nothing is known of the steps that the last segment lacks, so that segment is left out.
-# There are two easy ways to get this wrong:
+# recording merely stopped, and nothing is known about the missing steps of the last segment, so that segment is left
+# out. There are two easy ways to get this wrong:
 #
-# 1. **Whole segments only.** Short ones are inconvenient (arrays want one length), so drop them all.
+# 1. **Whole segments only.** Short ones are inconvenient (arrays need one length), so drop them all.
 # 2. **An end is an end.** Write `done = terminated or truncated`, as old environments and files do.
 #
-# To see what each does, we need no network. Cut the maze into squares of half a metre, and let every square look up
-# how things went from there: the expectile 0.9 (notebook 04 says why) of $R + \gamma V(s')$ over its segments, two
+# To see the effect of each we need no network. Divide the maze into squares of half a metre, and let every square look
+# up how things went from there: the expectile 0.9 (notebook 04 says why) of $R + \gamma V(s')$ over its segments, two
 # hundred times in turn.
 
 # %%
@@ -343,12 +343,12 @@ report = pd.DataFrame(report).set_index("ends")
 report.round(2)
 
 # %% [markdown]
-# *Whole segments only* loses nine of ten lines that enter the goal, and with them the last half metre: the best place
-# in the world now costs four skills. The way there is still right, so in this maze the mistake is hard to notice. For
-# a runner it is not: there a termination is a *fall*, and without those lines falling costs next to nothing.
+# *Whole segments only* loses nine of ten rows that enter the goal, and with them the last half metre: the best place in
+# the maze now costs four skills. The path to it is still right, so in this maze the mistake is hard to notice. For a
+# runner it is not: there a termination is a *fall*, and without those rows falling costs next to nothing.
 #
-# *An end is an end* is ruin. Every step costs 0.1, so wherever a recording happened to stop, the costs stopped, and
-# such places shine like goals. The learner is told to go to the nearest one and wait for the tape to run out.
+# *An end is an end* is fatal. Every step costs 0.1, so wherever a recording happened to stop, the costs stopped, and
+# such places look like goals. The learner is taught to go to the nearest one and wait for the recording to end.
 #
 # ## What you should see
 
@@ -377,8 +377,8 @@ checks.round(3)
 # %% [markdown]
 # ## Exercises
 #
-# 1. Relabel with the skills that you learnt in notebook 02 (eight codes, a small model). Is the same skill again more
-#    or less frequent? Which of the two tables would you rather learn from?
+# 1. Relabel with the skills that you learnt in notebook 02 (eight codes, a small model). Does a skill follow itself
+#    more or less often? Which of the two tables would you rather learn from?
 # 2. Let `look_up_values` discount with `GAMMA**HORIZON`. Find the square where two neighbours first differ by less than
 #    0.05. How far is it from the start?
 # 3. Replace the expectile 0.9 by 0.5 (the mean over all drives, wherever they were headed). Does the map still lead

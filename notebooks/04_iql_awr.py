@@ -14,8 +14,8 @@
 # # 04 · IQL and AWR: learn when to use which skill
 #
 # **What you will see:** two short formulas, a value function that spreads backwards from the goal while it learns, a
-# policy drawn from it by weighted imitation, and why simply taking the best-looking skill fails, in numbers, on a map
-# and as a clip.
+# policy extracted from it by weighted imitation, and why simply taking the best-looking skill fails, in numbers, on a
+# map and as a clip.
 #
 # **Time:** one to two minutes on two CPU cores. No network, no GPU, no graphics driver.
 
@@ -56,9 +56,9 @@ RUNS = Path("../runs/notebooks/04")  # what this notebook writes lies here
 # %% [markdown]
 # ## The table to learn from
 #
-# Drives between random places, told in the skills of the shipped agent (notebook 03): each line says in which state
-# which skill $k$ was used, what it earned and where it led. Every step costs 0.1 until the goal is entered, so a skill
-# of ten steps costs almost 1, and the value of a state says, discounted, how many skills away the goal is.
+# Drives between random places, relabelled with the skills of the shipped agent (notebook 03): each row says in which
+# state which skill $k$ was used, what it earned and where it led. Every step costs 0.1 until the goal is entered, so a
+# skill of ten steps costs almost 1, and the value of a state is, up to discounting, the number of skills to the goal.
 
 # %%
 task = get_task("pointmaze-large-diverse")
@@ -83,16 +83,16 @@ pd.DataFrame(
 # %% [markdown]
 # ## Two formulas
 #
-# **How good is a state?** The drives in the data were headed anywhere, so the *mean* outcome is poor. IQL (implicit
-# Q-learning) asks instead how good it is *when things are done well*, with an asymmetric loss (equation 7)
+# **How good is a state?** The drives in the data went anywhere, so the *mean* outcome is poor. IQL (implicit
+# Q-learning) asks instead how good the state is *when things are done well*, with an asymmetric loss (equation 7)
 #
 # $$L_V = \left|\tau - \mathbb{1}(u < 0)\right| u^2, \qquad u = Q(s, k) - V(s)$$
 #
-# whose minimum is an **expectile**: $\tau = 0.5$ gives the mean, $\tau$ near 1 almost the best that was *seen*. No
-# action outside of the data is ever asked for.
+# whose minimum is an **expectile**: $\tau = 0.5$ gives the mean, $\tau$ near 1 almost the best that was *seen*. The
+# networks are never queried for actions outside the data.
 #
-# **What to do there?** AWR (advantage-weighted regression) imitates the data, but weighs each line by
-# $w = e^{\alpha (Q(s, k) - V(s))}$ (equation 9): what turned out better than expected counts more.
+# **What to do there?** AWR (advantage-weighted regression) imitates the data, but weights each row by $w = e^{\alpha
+# (Q(s, k) - V(s))}$ (equation 9): what turned out better than expected counts more.
 
 # %%
 outcomes = torch.cat([torch.normal(-20.0, 2.0, (700,)), torch.normal(-12.0, 1.5, (300,))])
@@ -115,11 +115,11 @@ figure
 # %% [markdown]
 # ## Learn, and watch the value spread
 #
-# The value map is redrawn while critic and policy learn. At first every place looks the same. Then all values
-# sink, for every skill costs about 1, but near the goal they stop soon, and skill by skill the difference spreads
+# The value map is redrawn while critic and policy learn. At first every place looks the same. Then all values sink,
+# because every skill costs about 1, but near the goal they soon stop, and skill by skill the difference spreads
 # backwards: $Q(s, k)$ learns from $R + \gamma V(s')$ (equation 8), $V$ from $Q$. It has to spread *around* walls, which
-# a smooth network does not like; that is what the Fourier features are for. Each colour covers the same area. The
-# numbers are the likeliest skill for a body at rest, the arrows show where that skill leads such a body on average.
+# is hard for a smooth network; that is what the Fourier features are for. Each colour covers the same area. The numbers
+# are the likeliest skill for a body at rest, the arrows show where that skill leads such a body on average.
 
 # %%
 replays = replay_skills(task, agent, steps=20)  # every skill from eight places, as in notebook 02
@@ -181,7 +181,7 @@ trainer = pl.Trainer(
 trainer.fit(policy, datamodule=transitions)
 
 # %% [markdown]
-# The same again as four moments side by side, one square a cell, dark is far from the goal:
+# The same as four snapshots side by side, one square per cell; dark is far from the goal:
 
 # %%
 moments = sorted(watch.maps)
@@ -205,9 +205,9 @@ figure
 # ## Why not simply take the best skill?
 #
 # $Q(s, k)$ is known for *all* 16 skills, so why not take the one with the highest? Because it was **learnt** only for
-# skills that the data show in that state; for the others the network makes something up. Some of those inventions are
-# too high, and a maximum finds exactly these. Here is the shipped agent, fully trained, for a body at rest at the
-# start: how often the data near there use each skill, what the critic believes, and what the policy makes of it.
+# skills that the data contain in that state; for the others the network extrapolates. Some of those values are too
+# high, and a maximum picks exactly these. Here is the shipped agent, fully trained, for a body at rest at the start:
+# how often the data near there use each skill, what the critic believes, and what the policy makes of it.
 
 # %%
 shipped = agent.policy
@@ -236,9 +236,9 @@ panels[1].annotate("argmax-Q takes this", (best, advantage[best]), xytext=(best 
 figure
 
 # %% [markdown]
-# The policy only ever *imitates*, so a skill that is not in the data stays unlikely however high its Q. Let both play,
-# from the same starts, and beside them the little policy that learnt above (a third of the data and of the steps, and
-# half the width of the shipped one):
+# The policy only ever *imitates*, so a skill that is not in the data stays unlikely, however high its Q. Let both play
+# from the same starts, together with the small policy trained above (a third of the data and of the steps, and half the
+# width of the shipped one):
 
 # %%
 contestants = [
@@ -255,15 +255,15 @@ scores[["episodes", "success", "length_success"]].rename(
 ).round(0)
 
 # %% [markdown]
-# Where did argmax-Q end? Sooner or later one of these inventions presses the body against a wall. There the state no
-# longer changes, so the same maximum takes the same skill again, until time is up. Nothing in the data could have
-# warned it: this is the error of *acting outside of the data*, and weighted imitation is the cure.
+# Where did argmax-Q end? Sooner or later one of these overestimated skills presses the body against a wall. There the
+# state no longer changes, so the same maximum picks the same skill again, until time is up. Nothing in the data could
+# have warned it: this is the error of *acting outside the data*, and weighted imitation is the cure.
 
 # %%
 plot_failures(task, result, "argmax-Q")
 
 # %% [markdown]
-# One of these episodes, from the start to the end of time. The number on the ball is the skill:
+# One of these episodes, from the start until time is up. The number on the ball is the skill:
 
 # %%
 episodes = result.episodes[result.episodes["actor"] == "argmax-Q"]
@@ -272,7 +272,7 @@ clip = write_clip(RUNS / "argmax.gif", task, result.paths["argmax-Q", episode], 
 Image(data=clip.read_bytes(), format="png")  # a GIF all the same: pages that know only "png" then play it too
 
 # %% [markdown]
-# The value map of the shipped policy, for comparison with yours. Here every arrow was really played, from the middle
+# The value map of the shipped policy, for comparison with yours. Here every arrow was actually played, from the middle
 # of its cell:
 
 # %%
@@ -306,7 +306,7 @@ checks.round(2)
 # 1. Learn with `tau=0.5`. What does the value of a junction mean then, and what happens to the arrows?
 # 2. Learn with `fourier_features=0`. Where does the value leak through a wall, and where do episodes end?
 # 3. `alpha=0` turns AWR into plain imitation of the data. Let it play. Then try `alpha=50`: which number in
-#    `policy.terms` says that only a few lines are still being imitated?
+#    `policy.terms` shows that only a few rows are still being imitated?
 #
 # ## The same at full size
 #

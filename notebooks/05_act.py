@@ -13,14 +13,14 @@
 # %% [markdown]
 # # 05 · Act and evaluate in MuJoCo (video)
 #
-# **What you will see:** noise becoming an action in five steps, the clock that changes skills, a Hopper and an Ant on
-# video, one agent that acts in seven ways with confidence intervals, what the evaluation counts and why it counts it
-# so, how long one action takes, and where the Ant fails.
+# **What you will see:** noise turning into an action in five steps, the clock that changes skills, a Hopper and an Ant
+# on video, one agent acting in seven ways, with confidence intervals, what the evaluation counts and why, how long one
+# action takes, and where the Ant fails.
 #
-# **Time:** about two minutes on two CPU cores. No network, no GPU. Where a graphics driver is there, MuJoCo renders the
-# Hopper's video; elsewhere it is a stick figure.
+# **Time:** about two minutes on two CPU cores. No network, no GPU. With a graphics driver MuJoCo renders the Hopper's
+# video; without one it is a stick figure.
 #
-# Nothing learns here: three trained agents, which come with the package, act.
+# Nothing is trained here: three agents that ship with the package act.
 
 # %%
 # %matplotlib inline
@@ -47,7 +47,8 @@ from dds_lightning.interpret.draw.rendering import render_frames
 from dds_lightning.interpret.draw.stitching import draw_timeline
 from dds_lightning.interpret.draw.strobe import body_clip, plot_strobes
 from dds_lightning.interpret.measure.body import body_frames
-from dds_lightning.interpret.measure.replay import body_states, simulator
+from dds_lightning.interpret.measure.replay import simulator
+from dds_lightning.interpret.measure.states import body_states
 from dds_lightning.rollout import Contestant, RolloutResult, rollout
 from dds_lightning.study.tables import readable, summary_table, wilson
 
@@ -63,7 +64,8 @@ RUNS = Path("../runs/notebooks/05")  # what this notebook writes lies here
 # %% [markdown]
 # ## Three agents
 #
-# A ball in a maze, an Ant in a maze, and a leg that hops. Observations and actions differ, the agent's parts do not.
+# A ball in a maze, an Ant in a maze, and a leg that hops. Observations and actions differ; the parts of the agent are
+# the same.
 
 # %%
 RUNS.mkdir(parents=True, exist_ok=True)
@@ -94,14 +96,14 @@ pd.DataFrame(
 # ## One action: from noise in five steps
 #
 # Every $H$ steps the policy picks a skill $k$, and the codebook turns it into a vector $z_k$. Then, at *every* step,
-# the decoder makes an action (section 4.4 of the paper): it draws Gaussian noise $x_5$ and removes a part of it five
-# times. The network $\epsilon_\psi$ says which part of $x_t$ is noise, given the state and the skill; from that follows
-# a guess of the clean action,
+# the decoder generates an action (section 4.4 of the paper): it draws Gaussian noise $x_5$ and removes part of it five
+# times. The network $\epsilon_\psi$ predicts which part of $x_t$ is noise, given the state and the skill; this gives an
+# estimate of the clean action,
 #
 # $$\hat x_0 = \frac{x_t - \sqrt{1 - \bar\alpha_t}\; \epsilon_\psi(x_t, t, s, z_k)}{\sqrt{\bar\alpha_t}}$$
 #
-# which is cut to the box $[-1, 1]$. The next $x_{t-1}$ lies between $x_t$ and this guess, with a little fresh noise
-# (the posterior of DDPM); the last guess is the action. Here is the whole loop, written out:
+# which is clipped to the box $[-1, 1]$. The next $x_{t-1}$ lies between $x_t$ and this estimate, with a little fresh
+# noise (the posterior of DDPM); the last estimate is the action. Here is the whole loop, written out:
 
 
 # %%
@@ -171,12 +173,12 @@ for ax in panels[:, 0]:
 figure
 
 # %% [markdown]
-# $\bar\alpha_t$ is the share of the action in $x_t$: nearly nothing at first (both skills begin with one and the same
-# cloud), all at the end. The grey square is the box of allowed actions. One cloud of noise, two skills, two pushes, and
-# each keeps some width: the decoder has learnt a *distribution*, as wide as the data were in such states.
+# $\bar\alpha_t$ is the share of the action in $x_t$: almost nothing at first (both skills begin with the same cloud),
+# all of it at the end. The grey square is the box of allowed actions. One cloud of noise, two skills, two pushes, each
+# with some width: the decoder has learnt a *distribution*, as wide as the data were in such states.
 #
-# The **noise scale** multiplies every draw. With 0 the decoder always starts in the middle and gives one and the same
-# action; with 1 it gives what the data held.
+# The **noise scale** multiplies every draw. With 0 the decoder always starts in the middle and returns the same action;
+# with 1 it reproduces the spread of the data.
 
 # %%
 figure = Figure(figsize=(8.0, 2.6), layout="constrained")
@@ -196,8 +198,8 @@ figure
 # ## When the skill changes
 #
 # The agent keeps a clock for each environment. It chooses at the first step and then every $H = 10$, whatever happens
-# in between. An environment that begins a new episode tells so (`restarted`), and only *its* clock starts anew. Below,
-# three mazes side by side; the second one is reset after 17 steps.
+# in between. When an environment begins a new episode, the agent is informed (`restarted`), and only *that* clock is
+# reset. Below, three mazes side by side; the second one is reset after 17 steps.
 
 # %%
 envs = [maze.make_env() for _ in range(3)]
@@ -225,7 +227,7 @@ figure
 # %% [markdown]
 # ## The Hopper runs
 #
-# This is the loop that any robot needs. Here it also keeps the simulator's state, to draw it.
+# This is the loop that any robot needs. Here it also records the simulator's state for drawing.
 
 # %%
 hopper, leg = agents["hopper-medium-expert"], tasks["hopper-medium-expert"]
@@ -280,7 +282,7 @@ with simulator(leg) as inside:
 plot_strobes(leg, pieces, every=5, title="Hopper: ten steps (80 ms) of each skill, a body every five")
 
 # %% [markdown]
-# And the video, at half speed. The strip below is the skill in use over the whole clip.
+# And the video, at half speed. The strip below shows the skill in use over the whole clip.
 
 
 # %%
@@ -343,9 +345,9 @@ figure.axes[0].set_ylabel("probability")
 figure
 
 # %% [markdown]
-# Now each way plays the same twelve starts. The picture is redrawn whenever one is done. A dot is the share of
-# successes and the line its 95 % interval (Wilson's): with so few episodes it is long, and two ways whose lines overlap
-# as much as those of the first five are *not* told apart.
+# Now each way plays the same twelve starts. The picture is redrawn whenever one has finished. A dot is the share of
+# successes, and the line its 95 % interval (Wilson's): with so few episodes it is long, and two ways whose lines
+# overlap as much as those of the first five *cannot* be distinguished.
 
 # %%
 ways = {
@@ -389,7 +391,7 @@ summary = summary_table(episodes)
 readable(summary, yard)
 
 # %% [markdown]
-# ## What is counted, and why so
+# ## What is counted, and why
 #
 # One row of the evaluator's table is one episode:
 
@@ -399,15 +401,16 @@ some = episodes[episodes["actor"] == "argmax-Q"].head(4)
 some[columns].assign(decisions=some["codes"].map(len))
 
 # %% [markdown]
-# * **success**: the goal was reached in *any* step. In a maze that ends the episode at once (`terminated`), so one
-#   episode counts once, and time spent on the goal earns nothing. Runners have no goal: there it is missing, not false.
-# * **score**: from the *environment's* rewards, never from the scaled ones that the learner sees. In a maze the return
-#   is 1 or 0, so score and success are the same number.
+# * **success**: the goal was reached at *any* step. In a maze that ends the episode at once (`terminated`), so one
+#   episode counts once, and time spent at the goal earns nothing. Runners have no goal, so the value is missing, not
+#   false.
+# * **score**: computed from the *environment's* rewards, never from the scaled ones that the learner sees. In a maze
+#   the return is 1 or 0, so score and success are the same number.
 # * **length**: steps. A failure lasts to the cap, so the mean length mixes two things; look at that of the successes.
-# * **seed**: episode $i$ of every contestant has the same. Who starts where is no part of the difference.
-# * **how many**: everybody plays a number of episodes that is fixed *before*. The classic mistake is to let many
-#   environments run side by side and to stop when enough episodes are over: successes end early, failures late, and so
-#   those that are over are mostly successes. What that would have told here, had we stopped at half:
+# * **seed**: episode $i$ has the same seed for every contestant, so differences cannot come from the starts.
+# * **how many**: everybody plays a number of episodes that is fixed *in advance*. The classic mistake is to run many
+#   environments side by side and stop when enough episodes are over: successes end early and failures late, so the
+#   finished ones are mostly successes. What that would have reported here, had we stopped half-way:
 
 # %%
 rows = []
@@ -421,7 +424,7 @@ stopped.round(0)
 # %% [markdown]
 # ## The Ant on its way
 #
-# Its ways to the goal, coloured by skill:
+# Its paths to the goal, coloured by skill:
 
 # %%
 plot_trajectories(yard, result, "greedy")
@@ -465,9 +468,9 @@ Image(data=clip, format="png")
 # %% [markdown]
 # ## What goes wrong
 #
-# Averages hide it, so look at the failures one by one. The recorded observations tell how each ended: on
-# its back (the torso's own z axis points down), pressed against something (less than half a metre in the last 100
-# steps), or still on its way.
+# Averages hide the causes, so look at the failures one by one. The recorded observations show how each ended: on its
+# back (the torso's own z axis points down), pressed against something (less than half a metre in the last 100 steps),
+# or still on its way.
 
 # %%
 rows = []
@@ -486,16 +489,16 @@ plot_failures(yard, result, "argmax-Q")
 
 # %% [markdown]
 # Argmax-Q finds the way as well as the others, and then mostly ends *beside* the goal. As in D4RL, each episode draws
-# its own goal from the outlined area, and the agent is not told where it is: it has to search. The policy imitates how
-# the data search; the maximum of the critic prefers skills that the data hardly hold there (notebook 04). Random skills
-# never get that far.
+# its own goal from the outlined area, and the agent does not know where it is: it has to search. The policy imitates
+# how the data search; the critic's maximum prefers skills that hardly occur there in the data (notebook 04). Random
+# skills never get that far.
 
 # %% [markdown]
 # ## How long does one action take?
 #
-# A robot cannot wait. A line is the processor time of one call of `act`, the least of 60, on one thread (what else the
-# machine does is not counted); the dashed line is the time that a step of that robot takes. An action costs five passes
-# through a small network, whatever the robot; 64 robots at once cost about three times as much as one.
+# A robot cannot wait. Each point is the processor time of one call of `act`, the minimum of 60, on one thread
+# (other processes are not counted); the dashed line is the duration of one step of that robot. An action costs five
+# passes through a small network, whatever the robot; 64 robots at once cost about three times as much as one.
 
 # %%
 sizes = (1, 4, 16, 64)
@@ -565,10 +568,10 @@ checks.round(2)
 # %% [markdown]
 # ## Exercises
 #
-# 1. Now and then the Hopper falls. Find a seed with which it does, and film the 200 steps before.
+# 1. Now and then the Hopper falls. Find a seed with which it does, and film the 200 steps before the fall.
 # 2. Stop the denoising loop early: what would the action be if the *first* guess of $\hat x_0$ were taken, after one
 #    pass instead of five? Draw the clouds of the guesses.
-# 3. How many episodes does it take to tell 90 % from 95 %? Work it out with `wilson`, then look at the tables of
+# 3. How many episodes does it take to distinguish 90 % from 95 %? Work it out with `wilson`, then look at the tables of
 #    papers.
 #
 # ## The same at full size

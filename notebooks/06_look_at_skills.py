@@ -14,15 +14,15 @@
 # # 06 · Look at the skills
 #
 # **What you will see:** what each of a maze agent's sixteen skills does from the same places, how its policy strings
-# them together, how surely a skill is told from what it does, what the critic believes of every cell, the skills of a
-# hopping leg as a stroboscopic picture, an honest look at what they mean there, discrete beside continuous skills, and
-# all of it as one page to keep.
+# them together, how reliably a skill can be recognised from what it does, what the critic believes about every cell,
+# the skills of a hopping leg as a stroboscopic picture, an honest look at what they mean there, discrete compared with
+# continuous skills, and all of it as one page to keep.
 #
 # **Time:** about two minutes on two CPU cores. No network, no GPU, no graphics driver.
 #
-# Nothing learns here: two agents that come with the package are looked at. The paper does the same in its section 5.2
-# and claims that discrete skills can be *interpreted*. Pictures invite to see in them what one hopes for, so there is a
-# number with each claim, and beside it what chance would give.
+# Nothing is trained here: we look at two agents that ship with the package. The paper does the same in its section 5.2
+# and claims that discrete skills can be *interpreted*. It is easy to see in a picture what one hopes to see, so each
+# claim comes with a number, and with the number that chance would give.
 
 # %%
 # %matplotlib inline
@@ -80,7 +80,7 @@ RUNS = Path("../runs/notebooks/06")  # what this notebook writes lies here
 # ## Two agents and some data
 #
 # A ball in a maze and a leg that hops, both with sixteen skills of ten steps. Data are needed to know in which states
-# the skills are at home; some are collected on the spot, with the recipes that the agents learnt from.
+# the skills are normally used; some are collected on the spot, with the recipes of the agents' training data.
 
 # %%
 torch.set_num_threads(1)  # small networks: a second thread costs more than it brings
@@ -96,9 +96,9 @@ print(f"leg:  {hops.num_steps:,} steps in {hops.num_episodes} runs")
 # %% [markdown]
 # ## What does a skill do?
 #
-# The policy only ever says a number $k$; what happens then is the decoder's work, $a \sim p(a \mid z_k, s)$ at every
+# The policy only ever outputs a number $k$; what happens then is up to the decoder, $a \sim p(a \mid z_k, s)$ at every
 # step. So hold one number and look. The simulator is put into a state, the ball at rest at a junction, and skill $k$ is
-# played for a hundred steps, ten times as long as the policy would. One panel a skill, the same eight starts in each
+# played for a hundred steps, ten times as long as the policy would. One panel per skill, the same eight starts in each
 # (figure 4, a to c and e to g, of the paper):
 
 # %%
@@ -108,9 +108,10 @@ positions = replays.qpos[..., :2]
 plot_starts_by_skill(maze, positions[:, 0], positions, replays.codes, replays.alive)
 
 # %% [markdown]
-# Nobody told the model what "right" or "up" is, and yet most skills are a direction, whatever the place: the same
-# number goes the same way everywhere, and slides along a wall that is in its way. A few are less clear; we come back to
-# them. Three of the starts from near, all sixteen skills in each. A number is where its skill ended, or left the panel:
+# The model was never given notions of "right" or "up", and yet most skills are a direction, whatever the place: the
+# same number goes the same way everywhere and slides along any wall in its way. A few are less clear; we come back to
+# them. A close-up of three of the starts, with all sixteen skills in each. A number is where its skill ended, or left
+# the panel:
 
 # %%
 some = replays.take(np.isin(replays.states, [1, 3, 4]))
@@ -130,9 +131,9 @@ Image(data=clip, format="png")  # a GIF all the same: pages that know only "png"
 # %% [markdown]
 # ## How are they strung together?
 #
-# No skill reaches the goal alone. The policy changes it every ten steps, and pieces of many drives become one way that
-# no drive ever took: *stitching* (figure 4, d and h). Above two episodes over the maze, with the number of a skill
-# where it takes over; below all of them over time:
+# No skill reaches the goal alone. The policy changes it every ten steps, and pieces of many drives become one path that
+# no drive ever took: *stitching* (figure 4, d and h). Above, two episodes in the maze, with the number of a skill where
+# it takes over; below, all of them over time:
 
 # %%
 result = rollout(
@@ -142,16 +143,16 @@ success = result.summary()["success"].iloc[0]
 plot_stitching(maze, result, "AWR policy")
 
 # %% [markdown]
-# ## Is a skill told by what it does?
+# ## Can a skill be recognised from what it does?
 #
-# "Skill 10 goes right" is a claim, and the encoder can judge it. Hold $k$ for ten steps, give what happened to the
-# encoder, and see which code it finds (equation 10):
+# "Skill 10 goes right" is a claim, and the encoder can judge it. Hold $k$ for ten steps, give the result to the
+# encoder, and see which code it assigns (equation 10):
 #
 # $$\hat k = \arg\min_j \lVert E(\tau_k) - z_j \rVert$$
 #
-# If $\hat k = k$, the behaviour gave its code away. **From any state:** every skill is held from the same states, drawn
-# from the data, so that a state says nothing about the code; by guessing one would be right in 1 of 16. Rows are what
-# was held, columns what was found:
+# If $\hat k = k$, the behaviour identified its code. **From any state:** every skill is held from the same states,
+# drawn from the data, so that a state says nothing about the code; guessing would be right in 1 of 16 cases. Rows are
+# the code that was held, columns the code that the encoder assigned:
 
 # %%
 with simulator(maze) as env:
@@ -163,10 +164,10 @@ plot_recovery(found)
 # %% [markdown]
 # The unclear ones from above are here again: a row with several dark squares is a skill that resembles others.
 #
-# **In its own states** asks what the policy relies on: take a segment of the data, hold *its* code from the state in
+# **In its own states** asks what the policy relies on: take a segment of the data and hold *its* code from the state in
 # which it begins. That is easier, and there is a trap: perhaps the state alone gives the code away, whatever the skill
-# does. So there is a **control**: hold *another* code there, and count how often the first one is still found. What the
-# skill itself does is the accuracy less the control.
+# does. So there is a **control**: hold *another* code there, and count how often the first one is still assigned. The
+# skill's own contribution is the accuracy minus the control.
 
 
 # %%
@@ -192,20 +193,20 @@ pd.DataFrame([told("PointMaze-Large", found, trip)]).round(1)
 # $$I(k; \Delta) = \sum_{k, \Delta} p(k, \Delta) \log_2 \frac{p(k, \Delta)}{p(k)\, p(\Delta)}$$
 #
 # in bits. Each displacement $\Delta$ is taken relative to the mean of all skills from the same state, because a ball
-# that is already rolling goes on rolling whatever it is told; and what shuffled codes have is taken off. Here is what
-# is measured, a dot a replay, a number the mean of its skill:
+# that is already rolling keeps rolling whatever the skill; and the information of shuffled codes is subtracted. Here is
+# what is measured: each dot is a replay, each number the mean of its skill:
 
 # %%
 plot_effects(maze, found)
 
 # %% [markdown]
-# Around the ring lie the directions, in the middle the skills that do little or do different things in different
+# The directions lie around the ring; in the middle are the skills that do little, or different things in different
 # places.
 #
 # ## What does the critic believe, and what does the policy choose?
 #
 # $V(s)$ of a ball at rest as colours, the likeliest skill of each cell as a number, and as an arrow where holding that
-# very skill from that very cell led. The arrows follow the corridors to the goal, and $V$ rises along them:
+# skill from that cell led. The arrows follow the corridors to the goal, and $V$ rises along them:
 
 # %%
 plot_policy_map(maze, agent, HELD)
@@ -225,8 +226,8 @@ plot_transitions(transitions)
 # %% [markdown]
 # ## How free is the decoder?
 #
-# The decoder *draws* actions. In the same states, how much do they differ by noise alone (bars), and how much by the
-# code (marks)? Where the mark stands above the bar, the code says more than chance does:
+# The decoder *draws* actions. In the same states, how much do they vary with the noise alone (bars), and how much with
+# the code (marks)? Where the mark is above the bar, the code matters more than chance:
 
 # %%
 diversity = decoder_diversity(agent.skill, states.observations, noise_scale=agent.noise_scale)
@@ -237,7 +238,7 @@ plot_diversity(diversity)
 #
 # The Hopper's data are half an expert's and half a mediocre runner's. Every skill is held for a second from each of
 # eight states of the data; here are the state in which they differ most, and four skills in it (figure 3 of the paper).
-# A body every 0.12 s, the last one solid, lines are the ways of its joints:
+# One body every 0.12 s, the last one solid; the lines are the paths of its joints:
 
 # %%
 with simulator(hopper) as env:
@@ -255,7 +256,7 @@ frames = {int(k): body_frames(model, ways[k, state]) for k in chosen}
 plot_strobes(hopper, frames, every=15)
 
 # %% [markdown]
-# One of them in motion, three times slower than it is:
+# One of them in motion, slowed down three times:
 
 # %%
 one = max(frames, key=lambda k: len(frames[k]))
@@ -274,23 +275,23 @@ score = played.summary()["score"].iloc[0]
 plot_stitching(hopper, played, "AWR policy, greedy")
 
 # %% [markdown]
-# So what is a skill here? The numbers give the answer, and it is another one than in the maze:
+# So what is a skill here? The numbers give the answer, and it is not the same as in the maze:
 
 # %%
 numbers = pd.DataFrame([told("PointMaze-Large", found, trip), told("Hopper", leg_found, leg_trip)]).set_index("agent")
 numbers.round(1)
 
 # %% [markdown]
-# In their own states the leg's skills are found again nearly always. But look at the control: even with *another* code
-# held, the encoder mostly finds the first one, because a leg in mid-air has hardly a choice within 0.08 s. From any
+# In their own states the leg's skills are almost always recognised. But look at the control: even with *another* code
+# held, the encoder mostly assigns the first one, because a leg in mid-air has hardly any choice within 0.08 s. From any
 # state a skill is hardly recognised. In the maze a code says **what** to do; here it mostly says **when**: it is a
-# phase of the gait. That is no fault of the agent, whose score is above 100, but "skill 6 is a long jump" would be a
-# story, not a finding. Without the control one would have told it.
+# phase of the gait. That is not a fault of the agent, whose score is above 100, but "skill 6 is a long jump" would be a
+# story, not a result. Without the control we would have believed it.
 #
-# With only **four** skills, as in the paper's figures, it is the same: the maze's are told apart nearly always, also
-# from any state, and the leg's differ in what they do, as the picture shows (two of them fall), but not in a way that
-# the encoder would recognise from any state. By `dds skill fit` with `--model.num_skills 4` and `dds atlas`; chance is
-# 25 %:
+# With only **four** skills, as in the paper's figures, the result is the same: those of the maze are almost always
+# recognised, from any state too, and those of the leg differ in what they do, as the picture shows (two of them fall),
+# but not in a way that the encoder would recognise from any state. Made with `dds skill fit`, `--model.num_skills 4`
+# and `dds atlas`; chance is 25 %:
 #
 # | four skills | found again in own states | another code held there | from any state |
 # | --- | --: | --: | --: |
@@ -303,10 +304,10 @@ numbers.round(1)
 #
 # ## Would continuous skills do as well?
 #
-# The same model with a Gaussian in place of the codebook learns skills without numbers. To ask the same questions, its
-# encodings are put into four clusters, and a cluster's centre is what is replayed. Same data, same sizes, 2,500 steps,
-# three seeds each, measured on episodes that the training left out (mean ± standard deviation over seeds), by
-# `python benchmarks/compare_bottlenecks.py`:
+# The same model with a Gaussian in place of the codebook learns continuous skills. To ask the same questions, its
+# encodings are grouped into four clusters, and each cluster's centre is replayed. Same data, same sizes, 2,500 steps,
+# three seeds each, measured on held-out episodes (mean ± standard deviation over seeds), by `python
+# benchmarks/compare_bottlenecks.py`:
 #
 # | PointMaze-Large, K = 4, D = 64 | discrete | continuous, clustered |
 # | --- | --: | --: |
@@ -319,20 +320,20 @@ numbers.round(1)
 #
 # ![Discrete and continuous skills compared](figures/pointmaze-large-discrete-or-continuous-4.png)
 #
-# Neither wins everything. Discrete skills are **recognised** better: in every seed one of the four centres, the one
-# that hardly moves the ball, is never found again (hence exactly 75 %). Nobody trained the decoder on a centre; it is a
-# mean, while a codebook's vector is what every segment of its code was decoded from. But where the continuous model is
-# allowed its own vector for each segment, it **copies** the data better by a quarter, and its centres even say a little
-# more about where the ball goes. A number that one can choose, count and name costs detail: that is the trade, and the
-# policy, which must choose among finitely many skills, is what it is made for. (The Gaussian's KL weight is the
-# default, 0.01; it was not tuned, nor was anything else.)
+# Neither wins everywhere. Discrete skills are **recognised** better: in every seed one of the four centres, the one
+# that hardly moves the ball, is never recognised (hence exactly 75 %). The decoder was never trained on a centre, which
+# is a mean, whereas a codebook vector is what every segment of its code was decoded from. But where the continuous
+# model may use a separate vector for each segment, it **copies** the data better by a quarter, and its centres even say
+# a little more about where the ball goes. A number that can be chosen, counted and named costs detail: that is the
+# trade-off, made for the sake of the policy, which must choose among finitely many skills. (The Gaussian's KL weight is
+# the default, 0.01; it was not tuned, nor was anything else.)
 
 # %% [markdown]
 # ## All on one page
 #
 # `dds atlas` measures and draws all of this, and more: for each skill a clip, its share of the data, speed, turning,
-# reward, value, its nearest relatives. It writes one HTML file that needs nothing else: no network, no script; it opens
-# on a telephone as well, light or dark. The command says what it is doing:
+# reward, value, and the skills most like it. It writes one self-contained HTML file: no network, no scripts; it also
+# opens on a phone, in light or dark mode. The command reports its progress:
 
 # %%
 page = RUNS / "pointmaze-large.html"
@@ -372,8 +373,8 @@ checks.round(2)
 # ## Exercises
 #
 # 1. `rest_states(maze, [(1, 1), (7, 10)])` begins in cells of your choice. Find a place from which two skills that look
-#    alike elsewhere part.
-# 2. Replay with `noise_scale=0.0`, then `2.0`. Which skills change, and what does `plot_diversity` say of them?
+#    alike elsewhere diverge.
+# 2. Replay with `noise_scale=0.0`, then `2.0`. Which skills change, and what does `plot_diversity` show for them?
 # 3. Hold the leg's skills for fifty steps instead of ten before you encode the last ten. Are they recognised better?
 #    Why could that be?
 #

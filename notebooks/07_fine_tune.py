@@ -13,15 +13,15 @@
 # %% [markdown]
 # # 07 · Fine-tune from a checkpoint
 #
-# **What you will see:** the shipped skills, learnt in one maze, in a maze that they have never seen and on data of
-# another driver; which part of a skill model may be tuned without losing the policy that uses it, with the proof that
-# what is frozen does not change by a bit; a policy that gets a new goal while its skills stay as they are; a robot with
-# other sensors, and which weights still fit it; and what all of this saves against learning from nothing.
+# **What you will see:** the shipped skills, learnt in one maze, in a maze that they have never seen and on another
+# driver's data; which part of a skill model can be tuned without losing the policy that uses it, with proof that what
+# is frozen does not change by a single bit; a policy that gets a new goal while its skills stay the same; a robot with
+# different sensors, and which weights still fit it; and how much all of this saves compared with learning from scratch.
 #
 # **Time:** four to five minutes on two CPU cores. No network, no GPU, no graphics driver.
 #
-# Skills say how a body moves, the policy says where to. A new maze, goal or driver changes one of the two much more
-# than the other, so it should be possible to keep what did not change. Whether it is, is a question to measurements.
+# Skills determine how a body moves, the policy where it goes. A new maze, goal or driver changes one of the two much
+# more than the other, so it should be possible to keep what did not change. Whether it really is has to be measured.
 
 # %%
 # %matplotlib inline
@@ -62,10 +62,10 @@ CHECKPOINT = "../checkpoints/pointmaze-large"
 RUNS = Path("../runs/notebooks/07")  # what this notebook writes lies here
 
 # %% [markdown]
-# ## The shipped skills among strangers
+# ## The shipped skills on unfamiliar data
 #
 # They were learnt from 200,000 steps in PointMaze-**Large**, where a controller drives at 4.5 m/s. Two kinds of data
-# are new to them: the same driver in PointMaze-**Medium**, where the walls stand elsewhere, and a **careful driver** in
+# are new to them: the same driver in PointMaze-**Medium**, where the walls are elsewhere, and a **careful driver** in
 # Large, who keeps to 1.5 m/s.
 
 # %%
@@ -85,7 +85,7 @@ plot_skills_by_start(medium, **replay_skills(medium, shipped, steps=40))
 
 # %% [markdown]
 # In Medium they push in the same directions as at home. In numbers: how well does the decoder denoise the actions of
-# held-out segments, given the skill that the encoder names?
+# held-out segments, given the skill that the encoder assigns?
 #
 # $$\mathcal L_\text{diff} = \mathbb E_{i, \epsilon} \lVert \epsilon - \epsilon_\theta(a_i, i, s, z_k) \rVert^2$$
 
@@ -112,13 +112,13 @@ speeds = {name: float(np.linalg.norm(data.trajectories.observations[:, 2:], axis
 pd.DataFrame({"denoising loss, shipped skills": untuned, "speed in the data, m/s": speeds}).round(2)
 
 # %% [markdown]
-# A number alone says little: a careful driver's actions are smaller, and noise that nobody can foresee is in all of
-# them. What can be gained, tuning tells.
+# A number alone says little: a careful driver's actions are smaller, and all of them contain unpredictable noise.
+# Tuning shows how much there is to gain.
 #
 # ## Which part may learn?
 #
-# `init_from` starts a **new** training from the weights of a checkpoint, in Python by `starting_from`. (To go on with
-# a training that was stopped is something else: `ckpt_path`.) What learns is said by `trainable`:
+# `init_from` starts a **new** training from the weights of a checkpoint; in Python that is `starting_from`. (Resuming
+# an interrupted training is something else: `ckpt_path`.) `trainable` says which part learns:
 #
 # | `trainable` | encoder $E(\tau)$ | codebook $z_k$ | decoder $p(a \mid z_k, s)$ | good for |
 # | --- | :-: | :-: | :-: | --- |
@@ -127,11 +127,11 @@ pd.DataFrame({"denoising loss, shipped skills": untuned, "speed in the data, m/s
 # | `encoder` | learns | stays | stays | sorting new segments into the old skills |
 # | `all` | learns | learns | learns | new skills that begin as the old ones |
 #
-# Two more ways let everything learn. While skills learn, codes that hardly anybody uses are **restarted** from the data
-# every 100 steps; `restart_threshold=0` leaves them alone. And **discriminative rates** slow parts down:
-# `lr_scale={"encoder": 0.1, "codebook": 0.1}` gives encoder and codebook a tenth of the rate. The seventh starts from
-# nothing. All get the careful driver's data and 300 steps. Then each plays in Large under the shipped **policy**, which
-# nobody tells that the skills have changed:
+# Two more variants let everything learn. During skill training, codes that are hardly used are **restarted** from the
+# data every 100 steps; `restart_threshold=0` leaves them alone. And **discriminative rates** slow parts down:
+# `lr_scale={"encoder": 0.1, "codebook": 0.1}` gives encoder and codebook a tenth of the rate. The seventh variant
+# starts from scratch. All get the careful driver's data and 300 steps. Then each plays in Large under the shipped
+# **policy**, which does not know that the skills have changed:
 
 # %%
 ways = {
@@ -226,24 +226,25 @@ outcome["codes restarted"] = [
 outcome.round(2)
 
 # %% [markdown]
-# * **The decoder alone** takes what there is to gain, and the policy never notices: code 7 is still code 7.
-# * **Encoder alone** leaves what every code *does* as it was, so the policy plays on exactly as before.
-# * **Restarts make it a lottery** (`codebook`, `all`), of which the loss tells nothing. The careful driver hardly uses
-#   some of the codes that this policy lives on. They count as dead, are restarted from his data, and mean something
-#   else from then on. Three seeds of `all` took the old policy to the goal in 25, 60 and 80 % of 20 episodes.
-# * **Without restarts** everything may learn, and the same three seeds reach it in 100, 95 and 100 %.
-# * **From nothing** the codes have never met this policy.
+# * **The decoder alone** gains what there is to gain, and the policy never notices: code 7 is still code 7.
+# * **Encoder alone** does not change what a code *does*, so the policy plays exactly as before.
+# * **Restarts make it a lottery** (`codebook`, `all`), and the loss does not show it. The careful driver hardly uses
+#   some of the codes that this policy depends on. They count as dead, are restarted from the new data, and mean
+#   something else from then on. With three seeds of `all` the old policy reached the goal in 25, 60 and 80 % of 20
+#   episodes.
+# * **Without restarts** everything can learn, and the same three seeds reach it in 100, 95 and 100 %.
+# * **From scratch** the codes have nothing to do with this policy.
 #
-# So: tune the decoder, or say `restart_threshold=0`, if a policy is to be kept. Let codes restart if the policy is to
-# be learnt again on top (relabel first). The library remembers which skills a policy learnt with and refuses another
-# pair where it knows.
+# So: to keep a policy, tune the decoder or set `restart_threshold=0`. Let codes restart if you are going to train the
+# policy again on top (relabel first). A policy's checkpoint records which skills it was trained on, and the library
+# refuses a pair that it knows not to match.
 
 # %% [markdown]
 # ## What is frozen stays, bit for bit
 #
-# No gradient, no dropout, no running averages, no restart of dead codes: a frozen part ends as it began. Here is by how
-# much each part moved, in per cent of its length, $100 \cdot \lVert w' - w \rVert / \lVert w \rVert$. A zero is not
-# small, it is zero: `torch.equal` on every tensor.
+# No gradient, no dropout, no running averages, no restart of dead codes: a frozen part ends exactly as it began. Here
+# is how far each part moved, in per cent of its norm, $100 \cdot \lVert w' - w \rVert / \lVert w \rVert$. A zero is not
+# a small number but exactly zero: `torch.equal` on every tensor.
 
 # %%
 PARTS = {"encoder": "encoder.", "codebook": "bottleneck.vectors", "decoder": "decoder.net"}
@@ -263,8 +264,8 @@ moved.infer_objects().round(2)
 # %% [markdown]
 # ## A new goal: the policy learns, the skills stay
 #
-# Back in Large. The goal moves from the upper right to the lower right corner; a new reward means the same to the
-# learner. A task is a row of a table, and a copy of it with another goal is a task as well:
+# Back in Large. The goal moves from the upper right to the lower right corner; for the learner that is a new reward. A
+# task is a row of a table, and a copy of it with another goal is also a task:
 
 # %%
 new_goal = replace(large, name="pointmaze-large-new-goal", goal_cell=(7, 10))
@@ -328,10 +329,10 @@ for name, policy in policies.items():
 print("the skills are the same, bit for bit:", shipped.skill.fingerprint() == skill_before)
 
 # %% [markdown]
-# The skills had to learn nothing, and a minute of learning the policy is enough. But the **old policy is hardly a head
-# start**: both need their two to three thousand steps. What it knows best is the value of a place, and that is wrong
-# now; every target of its critic leads through its own old beliefs, so they fade slowly. Bright is near the goal,
-# numbers are the likeliest skill:
+# The skills did not have to learn anything, and a minute of policy training is enough. But the **old policy is hardly a
+# head start**: both need two to three thousand steps. What it knows best is the value of a place, and that is wrong
+# now; every target of its critic is built on its old beliefs, so they fade slowly. Bright is near the goal; numbers are
+# the likeliest skill:
 
 # %%
 free = np.array(large.free_cells())
@@ -361,7 +362,7 @@ draw_belief(right, new_goal, policies["from the old policy"].eval(), f"after {PO
 figure
 
 # %% [markdown]
-# And the agent on its way to a place where it has never been sent before:
+# And the agent on its way to a goal that it never had before:
 
 # %%
 result = plays["from the old policy"].result
@@ -372,8 +373,8 @@ Image(data=clip.read_bytes(), format="png")  # a GIF all the same: pages that kn
 # %% [markdown]
 # ## A robot with other sensors
 #
-# Now the robot also reports the push that it made a moment ago, so an observation has six numbers, not four. A network
-# with another input cannot be loaded whole. What fits is loaded, and the rest is listed:
+# Now the robot also reports its previous push, so an observation has six numbers instead of four. A network with a
+# different input cannot be loaded whole. What fits is loaded, and the rest is listed:
 
 # %%
 episodes = []
@@ -393,8 +394,8 @@ anew = told.partition("here): ")[2].count(";") + 1
 print(told.replace("; ", ";\n    ").replace("here): ", "here):\n    "))
 
 # %% [markdown]
-# Only the first layers start anew (the statistics too: they are taken from the new data). A part that is frozen must
-# not be random, so what cannot work is refused:
+# Only the first layers start from scratch (so do the statistics, which are taken from the new data). A frozen part must
+# not be random, so a combination that cannot work is refused:
 
 # %%
 try:
@@ -407,7 +408,7 @@ except UserError as error:
 print(refusal)
 
 # %% [markdown]
-# Does it help to bring what fits? The same 150 steps, on the data from home:
+# Does it help to load what fits? The same 150 steps, on the original data:
 
 # %%
 pl.seed_everything(0, verbose=False)
@@ -422,16 +423,16 @@ for name, model in zip(SENSOR_COLOURS, (adapted, fresh), strict=True):
 draw_losses(sensors, SENSOR_COLOURS, TUNING // 2)
 
 # %% [markdown]
-# **It does not.** What was brought sits behind first layers that are random: at first everything looks alike to the
-# encoder, three or four codes are left in use (from nothing it is about ten), and what was known is learnt anew rather
-# than kept. Bringing weights pays where the beginning of the network fits.
+# **It does not.** The loaded weights sit behind first layers that are random: at first everything looks alike to the
+# encoder, only three or four codes stay in use (from scratch about ten), and what was known is relearnt rather than
+# kept. Loading weights pays where the beginning of the network fits.
 #
 # ## What does it save?
 #
-# Learn PointMaze-**Large**, with skills from nothing or with skills that were learnt in **Medium** before.
-# `benchmarks/reuse_skills.py` did this with three seeds; its measurements lie beside this notebook. Bands are the range
-# over the seeds. On the right time is counted instead of steps, because a step of skill training costs about ten times
-# as much as one of the policy.
+# Learn PointMaze-**Large**, with skills learnt from scratch or with skills learnt in **Medium** before.
+# `benchmarks/reuse_skills.py` did this with three seeds; its measurements are stored next to this notebook. Bands are
+# the range over the seeds. The right panel shows time instead of steps, because a step of skill training costs about
+# ten times as much as a step of policy training.
 
 # %%
 study = pd.read_csv("figures/skills-reused.csv")
@@ -474,11 +475,11 @@ gain.round(0)
 
 # %% [markdown]
 # * **What is saved is the skill training.** Three quarters of the episodes succeed after 21 seconds with the reused
-#   skills and after 83 with those from nothing; on average over the seeds, all of which get there.
-# * **It is not won at the end.** There all four are alike within the spread of three seeds: nobody learns a better
-#   policy because its skills are older.
-# * **A little of everything is close.** A quarter of the skill training, from nothing, takes 38 seconds: pushing a ball
-#   is quickly learnt. What there is to save grows with what the skills cost.
+#   skills and after 83 with skills from scratch (the average over the seeds, all of which get there).
+# * **The final result is no better.** In the end all four are equal within the spread of three seeds: older skills do
+#   not lead to a better policy.
+# * **A little of everything is close.** A quarter of the skill training, from scratch, takes 38 seconds: pushing a ball
+#   is quickly learnt. The saving grows with the cost of the skills.
 #
 # ## What you should see
 
@@ -528,8 +529,8 @@ checks.round(2)
 #
 # 1. Tune all with restarts, with other seeds. Which codes are restarted, and which of them does the policy use?
 # 2. Tune the decoder on 3,000 steps of the careful driver. When does the held-out loss rise again?
-# 3. `PolicyModule.starting_from(CHECKPOINT, trainable="actor")` keeps the old critic. What can it learn of the new
-#    goal, and what not?
+# 3. `PolicyModule.starting_from(CHECKPOINT, trainable="actor")` keeps the old critic. What can it learn about the new
+#    goal, and what can it not?
 #
 # ## The same at full size
 #

@@ -13,13 +13,13 @@
 # %% [markdown]
 # # 08 · Your own data: from arrays or files to a trained agent
 #
-# **What you will see:** a robot that this library has never heard of, its recordings as plain NumPy arrays, what the
-# checks say to the usual mistakes, the same data as files of D4RL's and Minari's layout, an agent that learns from
-# them, drives, is published and loaded again; and a check that finds actions which are one step off.
+# **What you will see:** a robot that this library does not know, its recordings as plain NumPy arrays, how the checks
+# respond to the usual mistakes, the same data as files in D4RL's and Minari's layouts, an agent that learns from them,
+# drives, is published and loaded again, and a check that detects actions that are one step off.
 #
 # **Time:** about two minutes on two CPU cores. No network, no GPU, no graphics driver.
 #
-# To use it for your own robot, replace the first two sections by your recordings. Everything else stays.
+# To use it for your own robot, replace the first two sections with your recordings. Everything else stays the same.
 
 # %%
 # %matplotlib inline
@@ -63,8 +63,8 @@ RUNS = Path("../runs/notebooks/08")  # what this notebook writes lies here
 # ## A robot
 #
 # Yours is real; ours has to be simulated. It is a **cart with two driven wheels** in two rooms with a door between
-# them. It is told two motor voltages ten times a second and reports where it is and where it looks. It cannot move
-# sideways: to get round a corner it has to turn first.
+# them. It receives two motor voltages ten times a second and reports its position and heading. It cannot move sideways:
+# to get round a corner it has to turn first.
 
 # %%
 ROOMS = (
@@ -116,12 +116,12 @@ def free(x, y):
 
 
 # %% [markdown]
-# ### Tell the library what the robot is: one `Task`
+# ### Describe the robot to the library: one `Task`
 #
-# Learning needs arrays and nothing else. To *evaluate*, the library must know which environment to play, where it
-# starts and ends, and how returns become scores: that is a `Task`. The rooms are optional; with them every figure over
-# mazes works for you too. An environment that is registered with Gymnasium and whose `info` tells `success` (and, for
-# the figures, `position`) is all that a `Task` needs.
+# Learning needs only arrays. To *evaluate*, the library must know which environment to run, where it starts and ends,
+# and how returns become scores: that is a `Task`. The rooms are optional; with them every maze figure works for your
+# robot too. All that a `Task` needs is an environment that is registered with Gymnasium and whose `info` contains
+# `success` (and, for the figures, `position`).
 
 # %%
 if "Cart-v0" not in gym.registry:
@@ -147,9 +147,9 @@ cart = Task(
 # %% [markdown]
 # ## Your recordings
 #
-# Somebody drives it about with a joystick, from anywhere to anywhere, and nobody has the charging dock in mind. (Here
-# a controller steers to random places, with noise; now and then it lets go of the stick or fools about.) What the
-# cart reports is written down. One episode is five arrays; mind the **one more** observation, the state after the last
+# Somebody drives it around with a joystick, from anywhere to anywhere, without the charging dock in mind. (Here a
+# controller steers to random places, with noise; now and then it lets go of the stick or plays around.) Everything the
+# cart reports is recorded. One episode is five arrays; note the **one extra** observation, the state after the last
 # step.
 
 
@@ -213,10 +213,11 @@ print({name: array.shape for name, array in episodes[0].items()})
 
 # %% [markdown]
 # Where the *task* ends there is nothing left to earn, and the learner must not look beyond: a **termination**. Where
-# only the *recording* ends, life would have gone on: a **truncation**. Nothing else in the arrays decides as much.
+# only the *recording* ends, the episode would have gone on: a **truncation**. Nothing else in the arrays matters as
+# much.
 #
-# `from_episodes` checks everything and lays the episodes end to end. Actions have the unit that your robot takes; the
-# box says how far they may go, and the agent will never leave it.
+# `from_episodes` checks everything and concatenates the episodes. Actions are in your robot's units; the box gives
+# their limits, which the agent will never exceed.
 
 # %%
 data = Trajectories.from_episodes("cart", episodes, action_low=-VOLTS, action_high=VOLTS)
@@ -227,12 +228,12 @@ pd.Series(facts).drop("fingerprint").to_frame("cart")
 plot_dataset(data, cart)
 
 # %% [markdown]
-# Look at such a picture before anything is trained. Was every place visited (white: never)? Do actions fill the box, or
-# is something clipped? Do some episodes end in the dock? If none does, nothing can be learnt about it.
+# Look at such a picture before you train anything. Was every place visited (white: never)? Do the actions fill the box,
+# or is something clipped? Do some episodes end in the dock? If none does, nothing can be learnt about it.
 #
 # ## What is refused
 #
-# A learner that is trained on broken data fails late and silently, so the checks are strict, and each refusal names
+# A learner that is trained on broken data fails late and silently, so the checks are strict, and each error names the
 # episode, field and value. The usual mistakes, made with our own arrays:
 
 # %%
@@ -271,14 +272,13 @@ for mistake, changed in mistakes.items():
         print(f"{mistake}:\n    {error}\n")
 
 # %% [markdown]
-# Actions are allowed to leave the box by rounding only, and nothing is repaired silently: what to do about a lost
-# sensor is your decision. Some mistakes are sound numbers all the same (actions one step late, say); the last section
-# finds those.
+# Actions may exceed the box only by rounding, and nothing is repaired silently: what to do about a lost sensor is your
+# decision. Some mistakes look like sound numbers (actions one step late, for example); the last section detects those.
 #
 # ## Keep them, and look again
 #
 # One folder, which everything that takes `--data` reads as `arrays:FOLDER`. Every command of this library is one line
-# in a terminal; here they are typed by a small helper.
+# in a terminal; here a small helper runs them.
 
 
 # %%
@@ -295,14 +295,14 @@ status = dds(f"data check {folder} --horizon 10")
 status = dds(f"data show {folder} --episodes 3 --no_figure")
 
 # %% [markdown]
-# (Its last line compares widths and nothing else: a point mass in a maze has four observations and two actions as well.
-# Ours is none, so no `--task` is given.)
+# (Its last line compares only widths: a point mass in a maze also has four observations and two actions. Ours is not a
+# point mass, so no `--task` is given.)
 #
 # ## The same as a file in D4RL's layout
 #
-# Flat rows of steps, end to end, in one HDF5 file; many labs record so. Row $t$ holds the state before step $t$ and
-# what the step gave. With `next_observations` nothing is lost. Without them nobody knows where the last step of a
-# truncated episode led, so that step is left out.
+# Flat rows of steps, end to end, in one HDF5 file; many labs record data this way. Row $t$ holds the state before step
+# $t$ and the result of the step. With `next_observations` nothing is lost. Without them it is unknown where the last
+# step of a truncated episode led, so that step is left out.
 
 
 # %%
@@ -332,9 +332,9 @@ print(f"without: {lost} steps fewer; {facts['truncated episodes']} episodes were
 # %% [markdown]
 # ## And as a Minari data set
 #
-# Written with Minari itself, read without it: no code that a data set names is ever run. For that reason a set that
-# names an environment is accepted only if the table of `dds tasks` knows it. Write your own robot's without one, giving
-# the two spaces:
+# Written with Minari itself, read without it: no code that a data set names is ever executed. For that reason a data
+# set that names an environment is accepted only if the environment is in the table of `dds tasks`. Write your own
+# robot's data set without one, and give the two spaces:
 
 # %%
 os.environ["MINARI_DATASETS_PATH"] = str((RUNS / "minari").resolve())  # Minari wants a whole path
@@ -412,9 +412,9 @@ trainer.save_checkpoint(RUNS / "skill.ckpt")
 # %% [markdown]
 # ## Relabel
 #
-# Each segment becomes one line: in this state that skill was used, it earned so much and led there. There is no task of
-# the table to say how rewards are to be learnt, so we do: $0.1\,(r - 1)$, as in the mazes. Every step costs 0.1 until
-# the dock is reached, so the learner is in a hurry.
+# Each segment becomes one row: in this state that skill was used, it earned so much and led there. The robot is not in
+# the table of tasks, so we have to say ourselves how rewards are scaled: $0.1\,(r - 1)$, as in the mazes. Every step
+# costs 0.1 until the dock is reached, so the learner is in a hurry.
 
 # %%
 transitions = RelabeledDataModule.from_trajectories(
@@ -429,8 +429,8 @@ pd.DataFrame({"skill": codes, "drive, V": (left + right) / 2, "turn, V": (right 
 ).round(1)
 
 # %% [markdown]
-# Did it find anything? On the left the mean voltages of each segment, coloured by its skill: nobody told the model that
-# there is such a thing as a curve. On the right all eight skills for two seconds, from one pose (looking up, at rest).
+# Did it discover anything? On the left the mean voltages of each segment, coloured by its skill: the model had no prior
+# notion of a curve. On the right all eight skills for two seconds, from one pose (facing up, at rest).
 
 # %%
 figure = Figure(figsize=(9.0, 3.9), layout="constrained")
@@ -469,8 +469,8 @@ figure
 # %% [markdown]
 # ## Learn: when to use which
 #
-# Notebooks 03 and 04 explain what happens here. `fourier_features` let value and policy see walls; `fourier_seen=2`
-# says that they are made of the first two observations, the position.
+# Notebooks 03 and 04 explain what happens here. `fourier_features` let the value and policy networks see walls;
+# `fourier_seen=2` says that they are computed from the first two observations, the position.
 
 # %%
 pl.seed_everything(0, verbose=False)
@@ -483,8 +483,8 @@ trainer = train(policy, transitions, POLICY_STEPS, "v_mean", "q_loss", "effectiv
 trainer.save_checkpoint(RUNS / "policy.ckpt")
 
 # %% [markdown]
-# What it believes: how good is it to stand there, the mean over all headings? From the other room the dock is far, for
-# the way leads through the door.
+# What it believes: how good it is to be at a place, averaged over all headings. From the other room the dock is far,
+# because the way leads through the door.
 
 
 # %%
@@ -507,8 +507,8 @@ figure
 # ## Does it drive?
 #
 # Against two baselines: the same skills chosen at random, and **behaviour cloning**, a network that copies the joystick
-# without skills. Its loss below hardly falls: in one and the same place the joystick went in all directions, and a mean
-# of directions leads nowhere.
+# without skills. Its loss hardly falls: at any given place the joystick went in all directions, and a mean of
+# directions leads nowhere.
 
 # %%
 pl.seed_everything(0, verbose=False)
@@ -548,7 +548,7 @@ Image(data=clip.read_bytes(), format="png")  # a GIF all the same: pages that kn
 # %% [markdown]
 # ## On the robot
 #
-# What runs on the robot is four lines, and it needs neither the data nor the trainer. `reset` when a run begins, `act`
+# Four lines run on the robot, and they need neither the data nor the trainer. Call `reset` when a run begins and `act`
 # ten times a second:
 
 # %%
@@ -564,8 +564,8 @@ print(f"in the dock after {ticks / 10:g} s" if docked else "not in the dock afte
 # %% [markdown]
 # ## Publish it, load it again
 #
-# One folder with weights, settings, a card and hashes. It is verified before it takes its place, and nothing in it is
-# ever run.
+# One folder with weights, settings, a card and hashes. It is verified before it is put in place, and nothing in it is
+# ever executed.
 
 # %%
 place = RUNS / "cart-agent"
@@ -582,10 +582,10 @@ pd.Series({file.name: f"{file.stat().st_size / 1e3:.0f} kB" for file in sorted(p
 # %% [markdown]
 # ## If your robot is one of the table's: replay
 #
-# For Hoppers, Ants, point masses and so on, `dds data check --task NAME --replay N` finds what no look at the numbers
-# can: it puts the simulator into recorded states, takes the recorded actions, and compares where that leads. Here are
-# 1,500 steps of a point mass in a maze, recorded by a PD controller; and the same with a very common mistake: each
-# action is written down **one step late**.
+# For Hoppers, Ants, point masses and so on, `dds data check --task NAME --replay N` finds what cannot be seen in the
+# numbers: it puts the simulator into recorded states, takes the recorded actions, and compares where they lead. Here
+# are 1,500 steps of a point mass in a maze, driven by a PD controller, and the same with a very common mistake: each
+# action is recorded **one step late**.
 
 # %%
 point = get_task("pointmaze-umaze-diverse")
@@ -612,8 +612,8 @@ fits = dds(f"data check {RUNS}/point-right --task {point.name} --replay 200")
 misfits = dds(f"data check {RUNS}/point-late --task {point.name} --replay 200")
 
 # %% [markdown]
-# The exit status is 0 for data that fit and 1 for data that do not, for use in scripts. For such data
-# `dds run TASK --data arrays:FOLDER` does everything that this notebook did, in one command.
+# The exit status is 0 for data that match and 1 for data that do not, for use in scripts. For such data `dds run TASK
+# --data arrays:FOLDER` does everything that this notebook did, in one command.
 #
 # ## What you should see
 
@@ -642,9 +642,9 @@ checks.round(2)
 # %% [markdown]
 # ## Exercises
 #
-# 1. Give the dock another place (`goal_cell=(4, 1)`). Which parts have to be learnt anew, and which lines change?
-#    (`reward` and `terminations` say where the dock was; the skills do not care.)
-# 2. Record without the fooling about (`rng.random() < 0.0`). What happens to the skills that drive backwards, and to
+# 1. Move the dock (`goal_cell=(4, 1)`). Which parts have to be learnt again, and which rows change? (`reward` and
+#    `terminations` say where the dock was; the skills do not care.)
+# 2. Record without the playing around (`rng.random() < 0.0`). What happens to the skills that drive backwards, and to
 #    an agent that stands in front of a wall?
 # 3. Mark every truncation as a termination. What does the value map look like, and why?
 #

@@ -14,13 +14,13 @@
 # # 09 · Reproduce a row of the paper
 #
 # **What you will see:** one row of the paper's table 1, *hopper-medium-expert*, from data to number on a laptop: data
-# made on the spot and looked at, all stages of the method with a reduced recipe, the evaluation in the real simulator,
-# and, scored in the same way, the shipped agent of full size beside the paper's number.
+# collected on the spot and inspected, all stages of the method with a reduced recipe, the evaluation in the real
+# simulator, and, scored in the same way, the full-size shipped agent next to the paper's number.
 #
 # **Time:** four to five minutes on two CPU cores. No network, no GPU, no graphics driver.
 #
-# A number is reproduced when somebody else gets it by doing the same. So first: what is "the same"? Four things decide
-# a score before any learning does, and three of them differ here. They are named as they come.
+# A number is reproduced when somebody else gets it by doing the same. So first: what is "the same"? Four things affect
+# a score before any learning does, and three of them differ here. We point them out as they come up.
 
 # %%
 # %matplotlib inline
@@ -45,7 +45,8 @@ from dds_lightning.interpret.draw.dataset import plot_dataset
 from dds_lightning.interpret.draw.palette import skill_colour
 from dds_lightning.interpret.draw.strobe import body_clip, plot_strobes
 from dds_lightning.interpret.measure.body import body_frames
-from dds_lightning.interpret.measure.replay import body_states, simulator
+from dds_lightning.interpret.measure.replay import simulator
+from dds_lightning.interpret.measure.states import body_states
 from dds_lightning.interpret.measure.statistics import code_segments
 from dds_lightning.rollout import Contestant, rollout
 
@@ -62,9 +63,8 @@ RUNS = Path("../runs/notebooks/09")  # what this notebook writes lies here
 # %% [markdown]
 # ## The row
 #
-# A row is a body, a simulator, data and a way to score. The normalised score is D4RL's,
-# $100 \cdot (R - R_{min}) / (R_{max} - R_{min})$, with the two returns of the table: those of a random policy and of
-# D4RL's expert.
+# A row is a body, a simulator, data and a scoring rule. The normalised score is D4RL's, $100 \cdot (R - R_{min}) /
+# (R_{max} - R_{min})$, with the two returns of the table: those of a random policy and of D4RL's expert.
 
 # %%
 task = get_task("hopper-medium-expert")
@@ -81,14 +81,15 @@ pd.Series(
 ).to_frame("hopper-medium-expert")
 
 # %% [markdown]
-# **First difference: the simulator.** D4RL recorded in Gym's `Hopper-v2`, whose engine is no longer distributed as it
-# was. `Hopper-v4` is its heir on today's MuJoCo: the same body and rewards, nearly the same physics.
+# **First difference: the simulator.** D4RL recorded in Gym's `Hopper-v2`, whose engine is no longer distributed in that
+# form. `Hopper-v4` is its successor on today's MuJoCo: the same body and rewards, nearly the same physics.
 #
 # ## Data
 #
 # **Second difference: the data.** D4RL's file holds a million steps of a policy of medium skill and a million of an
 # expert. Here both come from a [ladder of policies](../checkpoints/behaviours/hopper/README.md) that were trained in
-# this project, with less noise; so few steps that they take seconds. Commands of this notebook run as in a terminal:
+# this project, with less noise, and only as many steps as can be collected in seconds. The commands of this notebook
+# run as in a terminal:
 
 
 # %%
@@ -124,8 +125,8 @@ plot_dataset(data, task)
 
 # %% [markdown]
 # Two kinds of episodes: short ones of the medium policy, which falls after three or four hundred steps, and long ones
-# of the expert, which mostly survives all 1,000. Nothing says which is which, and an imitation of everything is an
-# imitation of the mixture. How they move, one body every tenth of a second, from the middle of an episode of each:
+# of the expert, which mostly survives all 1,000. Nothing in the data says which is which, and imitating everything
+# imitates the mixture. How they move, one body every tenth of a second, from the middle of an episode of each:
 
 # %%
 order = np.argsort(data.returns)
@@ -144,15 +145,15 @@ plot_strobes(task, frames, every=13, title="one second of a medium episode (0) a
 # %% [markdown]
 # ## The recipe
 #
-# **Third difference: the amount of training.** The paper's settings are shipped to the letter (`--preset paper`); the
-# skills alone took two and a half hours on an RTX 4090, by the paper's own account. The preset of this body is made
-# for two CPU cores (`--preset locomotion`), and this notebook takes half of its steps or less, at larger rates, with a
+# **Third difference: the amount of training.** The paper's exact settings are shipped (`--preset paper`); according to
+# the paper the skills alone took two and a half hours on an RTX 4090. The preset for this body is designed for two CPU
+# cores (`--preset locomotion`), and this notebook uses half of its steps or fewer, at higher learning rates, with one
 # layer less in the encoder and narrower networks in the policy.
 #
-# A recipe this small sits near an edge, so two things are different on purpose: 32 skills instead of 16, and actions
-# without noise. With 16 skills and 2,500 steps two trials scored 101 and 54. In the second one the codes did not part
-# the two gaits (78 % of the segments lay in a code's commoner gait, in the first trial 98 %), and then nobody can
-# choose between them. One seed is no result.
+# A recipe this small is close to failing, so two things are deliberately different: 32 skills instead of 16, and
+# actions without noise. With 16 skills and 2,500 steps two trials scored 101 and 54. In the second the codes did not
+# separate the two gaits (78 % of the segments lay in a code's more common gait, in the first trial 98 %), and then no
+# policy can choose between them. One seed is not a result.
 
 # %%
 RECIPE = {
@@ -182,9 +183,9 @@ pd.DataFrame({name: [str(recipe.get(key, "-")) for key in SHOWN] for name, recip
 # %% [markdown]
 # ## Train
 #
-# `dds run` does every stage in one folder: skills (equation 14), relabelling, IQL and AWR (equations 6 to 9), a clone
-# as baseline, evaluation, report. The same command again does only what is missing, so here it stops first when the
-# policy is learnt. The curves are read from the files that it writes.
+# `dds run` runs every stage in one folder: skills (equation 14), relabelling, IQL and AWR (equations 6 to 9), a clone
+# as baseline, evaluation, report. Running the same command again does only what is missing, so here it first stops
+# after the policy. The curves are read from the files that it writes.
 
 # %%
 RUN = RUNS / f"run-{SEED}"
@@ -222,10 +223,11 @@ told = dds(f"{COMMAND} --fresh --until policy --json", draw_curves)
 seconds = json.loads(told)["seconds"]
 
 # %% [markdown]
-# ## What the skills found
+# ## What the skills discovered
 #
-# The data do not say who made which step, but the codes do: for each, the share of its segments that lie in the better
-# half of the steps (those of the expert). A policy that wants the expert's return has to choose on the right.
+# The data do not say which policy made which step, but the codes do: for each code, the share of its segments that lie
+# in the better half of the steps (those of the expert). A policy that wants the expert's return has to choose codes on
+# the right.
 
 # %%
 skill = SkillModule.load(RUN / "skill" / "last.ckpt")
@@ -248,9 +250,9 @@ figure
 # %% [markdown]
 # ## Evaluate
 #
-# **The fourth thing** is how, and how often, one plays. Skills are chosen greedily and actions drawn without noise; the
-# last checkpoint counts, not the best of several. Everybody plays the same starts. (20 episodes are usual, ten are
-# what time allows here.)
+# **The fourth thing** is how the agent is evaluated, and how often. Skills are chosen greedily and actions drawn
+# without noise; the last checkpoint counts, not the best of several. All contestants play the same starts. (20 episodes
+# are usual; time allows ten here.)
 
 # %%
 told = json.loads(dds(f"{COMMAND} --json"))
@@ -259,7 +261,7 @@ table = pd.DataFrame(told["table"]).query("kind != 'skill'").set_index("contesta
 table[["episodes", "score", "score_error", "return", "steps"]].astype(float).round(1)
 
 # %% [markdown]
-# The shipped agent: the same method with the CPU preset, 400,000 steps of such data, 8,000 and 12,000 steps of
+# The shipped agent: the same method with the CPU preset, 400,000 steps of data of this kind, 8,000 and 12,000 steps of
 # training. It plays the same starts:
 
 # %%
@@ -289,10 +291,10 @@ ax.spines[["top", "right"]].set_visible(False)
 figure
 
 # %% [markdown]
-# **The paper's number was measured with D4RL's data in D4RL's physics, ours with data of our own in `Hopper-v4`: the
-# two may stand side by side, but neither confirms or refutes the other.** What the bars do show is the method at work:
-# from data whose mean episode is poor, imitation gets what is in between, and the choice of skills gets out what the
-# better half can do.
+# **The paper's number was measured with D4RL's data in D4RL's physics, ours with data from this project in `Hopper-v4`:
+# they can be shown side by side, but neither confirms or refutes the other.** What the bars do show is the method at
+# work: from data whose mean episode is poor, imitation reaches something in between, and choosing skills recovers what
+# the better half can do.
 #
 # Our agent's first steps, as a clip:
 
@@ -311,8 +313,8 @@ Image(data=clip, format="png")  # a GIF all the same: pages that know only "png"
 # %% [markdown]
 # ## Where it loses
 #
-# Every run tells at which stage score gets lost. If the decoder's error is large, learn skills longer; if the best
-# single skill beats the policy, look at the critic.
+# Every run reports at which stage score is lost. If the decoder's error is large, train the skills for longer; if the
+# best single skill beats the policy, look at the critic.
 
 # %%
 diagnosis = told["diagnosis"]
@@ -351,7 +353,7 @@ checks.round(1)
 # 1. `SEED = 1`, then 2: by how much does the score move, and is "mean ± standard deviation over three seeds" the same
 #    thing as the ± in the table above?
 # 2. `DATA_STEPS = 400_000` with the same training: does the score follow the data or the training?
-# 3. Choose `hopper-medium`: there is no expert in the data. What is left of the distance to behaviour cloning?
+# 3. Choose `hopper-medium`: there is no expert in the data. How much of the advantage over behaviour cloning is left?
 #
 # ## The same at full size
 #
@@ -372,7 +374,7 @@ checks.round(1)
 # dds run hopper-medium --data minari:mujoco/hopper/medium-v0                   # what Minari has of this body
 # ```
 #
-# And the paper's settings to the letter, on a GPU (500,000 steps of skills, 1,500,000 of the policy):
+# And the paper's exact settings, on a GPU (500,000 steps of skills, 1,500,000 of the policy):
 #
 # ```bash
 # dds run hopper-medium-expert --data d4rl:hopper-medium-expert --preset paper --skill.trainer.accelerator=gpu \

@@ -16,6 +16,11 @@ from tests.recordings import Episode, record
 MAZE = "pointmaze-large-diverse"
 PAYLOAD = "payload_of_a_stranger:Env"
 STEPS = 20
+PART = re.compile(
+    r"(metadata|main_data)\.(json|hdf5)|episode_\d|(action|observation)[ _]space"
+    r"|env_spec|data_format|dataset_id|recorded (in|with|for)"
+)
+"""What a reader is sent to: a file, an episode, or an entry of the metadata."""
 
 
 @cache
@@ -25,13 +30,14 @@ def maze_episodes() -> list[Episode]:
 
 
 def refuse(folder: Path, task: str, message: str, sentinel: Path) -> None:
-    """Loading and checking must fail with one sentence, and leave the world as it was."""
+    """Loading must fail with one sentence that names the data set and its part, and leave the world as it was."""
     before = _world(folder)
     with pytest.raises(DataError) as refused:
         load_trajectories(f"local:{folder}", task)
     sentence = str(refused.value)
     assert re.search(message, sentence), sentence
-    assert "set-v0" in sentence
+    assert folder.name in sentence
+    assert PART.search(sentence), f"it names no file, episode or entry: {sentence}"
     assert len(sentence) < 1200
     assert sentence.isprintable()
     assert not re.search(r"[.!?] [A-Z]", sentence), "more than one sentence"

@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+import yaml
 from torch import nn
 
 from dds_lightning.agent import DDSAgent
@@ -26,7 +27,7 @@ class CodeSkill(nn.Module):
     def __init__(self):
         super().__init__()
         self.horizon, self.num_skills = H, K
-        self.hparams = {"observation_dim": 2, "action_dim": 1, "num_skills": K}
+        self.hparams = {"observation_dim": 2, "action_dim": 1, "num_skills": K, "noise_scale": 1.0}
         self.weight = nn.Parameter(torch.zeros(1))
 
     def decode(self, observations, codes, noise_scale=None, generator=None):
@@ -176,6 +177,17 @@ def test_variants_share_networks_and_leave_their_origin_alone(agent):
     np.testing.assert_array_equal(after, before)
 
 
+def test_the_noise_scale_is_the_agents_or_else_its_skill_models_and_a_null_stays_null_in_the_file(tmp_path):
+    agent = DDSAgent(*tiny_modules())
+    agent.skill.hparams["noise_scale"] = 0.25
+    assert agent.noise_scale == agent.variant("greedy").noise_scale == 0.25
+    assert agent.variant(noise_scale=0.0).noise_scale == 0.0
+    for given in (None, 0.5):
+        directory = agent.variant(noise_scale=given).save(tmp_path / str(given))
+        assert yaml.safe_load((directory / "config.yaml").read_text())["agent"]["noise_scale"] == given
+        assert DDSAgent.load(directory).noise_scale == (0.25 if given is None else given)
+
+
 def test_noise_scale_zero_is_deterministic_for_a_greedy_agent(agent):
     calm = agent.variant("greedy", noise_scale=0.0)
     np.testing.assert_array_equal(play(calm, 1), play(calm, 2))
@@ -276,12 +288,13 @@ def test_a_group_acts_as_its_members_would():
         own.reset(size, 0)
     rng = np.random.default_rng(0)
     rows = np.array([0, 1, 3, 4, 5, 6])  # the second member has finished
-    for _ in range(8):
+    for step in range(8):
         seen = rng.normal(size=(6, 4)).astype(np.float32)
         acted = group.act(seen, np.zeros(6, bool), rows)
         expected = [alone[0].act(seen[:2]), alone[2].act(seen[2:])]
-        np.testing.assert_allclose(acted, np.concatenate(expected), atol=1e-6)
-        assert group.codes[3:].tolist() == [0, 2, 0, 2]
+        np.testing.assert_allclose(acted.actions, np.concatenate(expected), atol=1e-6)
+        assert acted.codes[2:].tolist() == [0, 2, 0, 2]
+        assert acted.chosen.tolist() == [step % 5 == 0] * 6
 
 
 def test_agents_play_a_rollout_together(agent):

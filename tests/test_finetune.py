@@ -8,9 +8,9 @@ import torch
 from torch.utils.data import DataLoader
 
 from dds_lightning.errors import UserError
-from dds_lightning.saving.checkpoint import AtomicCheckpointIO
 from dds_lightning.saving.published import publish
 from dds_lightning.skill import SkillModule
+from tests.modules import changed, fit, state
 
 SMALL = {
     "hidden_dim": 16,
@@ -53,34 +53,9 @@ class Segments(pl.LightningDataModule):
         return DataLoader(batches, batch_size=None)
 
 
-def fit(module, data, steps, ckpt_path=None):
-    trainer = pl.Trainer(
-        max_steps=steps,
-        logger=False,
-        accelerator="cpu",
-        plugins=[AtomicCheckpointIO()],
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        limit_val_batches=0,
-    )
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", category=UserWarning, module="lightning")
-        trainer.fit(module, data, ckpt_path=ckpt_path, weights_only=True)
-    return trainer
-
-
 def skill(dim: int = 3, seed: int = 1, **settings) -> SkillModule:
     torch.manual_seed(seed)
     return SkillModule(dim, 2, **(SMALL | settings))
-
-
-def state(module) -> dict[str, torch.Tensor]:
-    return {name: value.clone() for name, value in module.state_dict().items()}
-
-
-def changed(before, after, prefix: str = "") -> set[str]:
-    return {name for name in before if name.startswith(prefix) and not torch.equal(before[name], after[name])}
 
 
 @pytest.fixture(scope="module")

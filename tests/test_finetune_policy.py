@@ -1,7 +1,5 @@
 """A policy that starts from another one's weights: for new rewards, with only one of its parts, in other states."""
 
-import warnings
-
 import lightning.pytorch as pl
 import pytest
 import torch
@@ -9,7 +7,7 @@ from torch.utils.data import DataLoader
 
 from dds_lightning.errors import UserError
 from dds_lightning.policy import PolicyModule
-from dds_lightning.saving.checkpoint import AtomicCheckpointIO
+from tests.modules import changed, fit, state
 
 
 class Transitions(pl.LightningDataModule):
@@ -45,35 +43,10 @@ class Transitions(pl.LightningDataModule):
         return DataLoader(batches, batch_size=None)
 
 
-def fit(module, data, steps, ckpt_path=None):
-    trainer = pl.Trainer(
-        max_steps=steps,
-        logger=False,
-        accelerator="cpu",
-        plugins=[AtomicCheckpointIO()],
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        limit_val_batches=0,
-    )
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", category=UserWarning, module="lightning")
-        trainer.fit(module, data, ckpt_path=ckpt_path, weights_only=True)
-    return trainer
-
-
 def policy(dim: int = 3, seed: int = 1, **settings) -> PolicyModule:
     torch.manual_seed(seed)
     settings = {"hidden_dims": [16], "extraction": "joint", "lr": 1e-3, "fourier_features": 4} | settings
     return PolicyModule(dim, settings.pop("num_skills", 4), **settings)
-
-
-def state(module) -> dict[str, torch.Tensor]:
-    return {name: value.clone() for name, value in module.state_dict().items()}
-
-
-def changed(before, after, prefix: str = "") -> set[str]:
-    return {name for name in before if name.startswith(prefix) and not torch.equal(before[name], after[name])}
 
 
 @pytest.fixture(scope="module")

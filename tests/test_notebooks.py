@@ -4,7 +4,6 @@ import ast
 import json
 import re
 import shlex
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,7 @@ import pytest
 from dds_lightning.cli.parser import build_parser, prepare
 from dds_lightning.tasks import task_names
 from dds_lightning.training.stage_cli import settings_of
-from notebooks.execute import cells_of_script, metadata_of, run_quick
+from notebooks.execute import cells_of_script, run_quick
 
 HERE = Path(__file__).parents[1] / "notebooks"
 SCRIPTS = sorted(HERE.glob("[0-9][0-9]_*.py"))
@@ -65,23 +64,17 @@ def test_script_and_notebook_agree(script):
     assert found == expected, "python notebooks/execute.py makes the notebook anew"
 
 
-@pytest.mark.skipif(find_spec("jupytext") is None, reason="jupytext is not installed (make notebooks-env)")
-@each_script
-def test_jupytext_reads_the_script_as_we_do(script):
-    from notebooks.execute import read
-
-    cells = [(cell["cell_type"], cell["source"], cell["metadata"]) for cell in read(script)["cells"]]
-    assert cells == [(cell.kind, cell.source, cell.metadata) for cell in cells_of(script)]
-
-
-def test_a_header_is_metadata_or_refused():
-    assert metadata_of(' tags=["parameters"] quick={"A": 1, "B": [2]}') == {
-        "tags": ["parameters"],
-        "quick": {"A": 1, "B": [2]},
-    }
-    assert metadata_of("") == {}
-    with pytest.raises(ValueError, match="says 'a title', expected name=JSON"):
-        metadata_of(" a title")
+def test_a_cell_has_a_line_and_metadata_or_its_header_is_refused():
+    text = '# %% [markdown]\n# prose\n\n# %% tags=["check"] quick={"A": 1, "B": [2]}\n# %time\nx = 1\n'
+    first, second = cells_of_script(text)
+    assert (first.kind, first.source, first.line) == ("markdown", "prose", 2)
+    assert (second.source, second.line) == ("%time\nx = 1", 5)
+    assert second.metadata == {"tags": ["check"], "quick": {"A": 1, "B": [2]}}
+    for header in ("# %% a title", "# %% tags=[broken"):
+        with pytest.raises(ValueError, match=re.escape(f"is '{header}', expected NAME=JSON")):
+            cells_of_script(f"{header}\nx = 1\n")
+    with pytest.raises(ValueError, match="got 2 cells for 1 headers; put no text before the first"):
+        cells_of_script("x = 1\n# %%\ny = 2\n")
 
 
 @each_script

@@ -94,7 +94,7 @@ def test_its_arrays_belong_to_its_own_task(tmp_path):
     assert facts["free cells visited"] == "3 of 3"
     assert 0 < facts["episodes that reach the goal"] == data.terminations.sum()
     assert dimensions["highest"].iloc[-1] <= BOX
-    with pytest.raises(DataError, match="found 3 columns, task 'hopper-medium' needs 11"):
+    with pytest.raises(DataError, match="got 3 columns, task 'hopper-medium' needs 11"):
         load_trajectories(f"arrays:{tmp_path / 'data'}", get_task("hopper-medium"))
 
 

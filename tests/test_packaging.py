@@ -1,5 +1,7 @@
 """The project as pip sees it: metadata, constraints, and the wheel."""
 
+import importlib
+import pkgutil
 import re
 import subprocess
 import sys
@@ -10,14 +12,16 @@ from pathlib import Path
 
 import pytest
 
+import datamodules
 import dds_lightning
+from dds_lightning.errors import UserError
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
-def _pins():
-    lines = (ROOT / "constraints.txt").read_text().splitlines()
+def _pins(file="constraints.txt"):
+    lines = (ROOT / file).read_text().splitlines()
     return dict(line.split("==") for line in lines if line and not line.startswith("#"))
 
 
@@ -41,6 +45,32 @@ def test_every_exact_version_is_inside_its_range():
         assert requirement.specifier.contains(_pins()[requirement.name.lower()]), line
 
 
+def test_the_oldest_versions_are_the_lower_bounds():
+    from packaging.requirements import Requirement
+    from packaging.version import Version
+
+    pins = {name.replace("_", "-"): Version(version) for name, version in _pins("constraints-oldest.txt").items()}
+    groups = [PROJECT["dependencies"], *PROJECT["optional-dependencies"].values()]
+    bounds = {}
+    for requirement in (Requirement(line) for group in groups for line in group):
+        (bound,) = [part.version for part in requirement.specifier if part.operator == ">="]
+        bounds[requirement.name.lower().replace("_", "-")] = Version(bound)
+    differing = {name: (bound, pins[name]) for name, bound in bounds.items() if pins[name] != bound}
+    assert set(differing) == {"torch"}, f"`make pin-oldest` after changing a lower bound: {differing}"
+
+
+def test_every_module_imports():
+    for package in (dds_lightning, datamodules):
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            if module.name.endswith("__main__") or ".examples." in module.name:
+                continue  # a script, which runs when it is imported
+            try:
+                importlib.import_module(module.name)
+            except UserError as error:
+                if "pip install 'dds-lightning[" not in str(error):  # an extra that is not installed
+                    raise
+
+
 def test_versions_known_to_be_bad_are_excluded():
     lines = {re.match(r"[\w-]+", line)[0]: line for line in PROJECT["dependencies"]}
     assert lines["lightning"] == "lightning>=2.6.6,<2.7"
@@ -55,6 +85,29 @@ def test_the_public_names_import():
         _ = dds_lightning.no_such_name
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("mypy") is None, reason="mypy is in the extra: dev")
+def test_a_strict_type_checker_sees_the_types_of_the_public_names(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from datamodules import Trajectories\n"
+        "from dds_lightning import DDSAgent, get_task\n"
+        "reveal_type(DDSAgent.load('x'))\n"
+        "reveal_type(get_task('x').observation_dim)\n"
+        "reveal_type(Trajectories.from_episodes)\n"
+    )
+    command = [sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", "--ignore-missing-imports"]
+    environment = {"MYPYPATH": str(ROOT), "PATH": "/usr/bin:/bin"}
+    checked = subprocess.run(
+        [*command, str(script)], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert checked.returncode == 0, checked.stdout
+    revealed = re.findall(r'Revealed type is "(.*)"', checked.stdout)
+    assert revealed[0].endswith("dds_lightning.agent.DDSAgent")
+    assert revealed[1].endswith("int")
+    assert "Any" not in revealed[2].split("->")[1], "the result of from_episodes has a type"
+
+
 @pytest.mark.skipif(find_spec("hatchling") is None, reason="hatchling (extra: dev) builds the wheel")
 def test_the_wheel_holds_both_packages_and_the_configurations_and_runs(tmp_path):
     command = [sys.executable, "-m", "pip", "wheel", str(ROOT), "--no-deps", "--no-build-isolation"]
@@ -67,6 +120,10 @@ def test_the_wheel_holds_both_packages_and_the_configurations_and_runs(tmp_path)
     configs = (ROOT / "dds_lightning" / "configs").rglob("*.yaml")
     expected = {str(path.relative_to(ROOT)) for path in configs}
     expected |= {"dds_lightning/cli/__init__.py", "datamodules/segments.py"}
+    expected |= {"dds_lightning/py.typed", "datamodules/py.typed"}
+    templates = [path for package in ("dds_lightning", "datamodules") for path in (ROOT / package).rglob("*.jinja")]
+    assert len(templates) >= 3
+    expected |= {"dds_lightning/interpret/atlas.css", *(str(path.relative_to(ROOT)) for path in templates)}
     expected.add("datamodules/behaviours/shipped_policies/ant/d4rl.safetensors")
     assert expected <= names
     strangers = {name.split("/")[0] for name in names} - {"dds_lightning", "datamodules"}

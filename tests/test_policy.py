@@ -1,5 +1,6 @@
 """Discrete IQL and AWR: on a chain whose values are known, and on hand-made batches."""
 
+import math
 import warnings
 
 import lightning.pytorch as pl
@@ -9,7 +10,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from torch.utils.data import DataLoader
 
 from dds_lightning.errors import UserError
-from dds_lightning.policy import PolicyModule
+from dds_lightning.policy import Judged, PolicyModule
 
 
 def small(**settings) -> PolicyModule:
@@ -151,7 +152,7 @@ def test_temperature_goes_from_sampling_to_greedy():
     states = torch.randn(400, 2)
     with torch.no_grad():
         greedy = module.codes(states, "greedy")
-        cold = module.codes(states, "sample", temperature=1e-3, generator=torch.Generator().manual_seed(0))
+        cold = module.codes(states, "sample", temperature=1e-6, generator=torch.Generator().manual_seed(0))
         warm = module.codes(states, "sample", temperature=1.0, generator=torch.Generator().manual_seed(0))
     assert torch.equal(cold, greedy)
     assert (warm == greedy).float().mean() < 0.9
@@ -161,16 +162,37 @@ def test_losses_touch_only_their_own_networks():
     module = small()
     data = batch()
     features = module.embed(data["observations"])
-    v = module.value(features).squeeze(-1)
-    critic_loss, _ = module.critic_loss(features, v, torch.zeros(8), data)
-    critic_loss.backward()
-    assert all(p.grad is not None for p in [*module.value.parameters(), *module.critic.parameters()])
-    assert all(p.grad is None for p in [*module.actor.parameters(), *module.target_critic.parameters()])
-    module.zero_grad()
-    actor_loss, _ = module.actor_loss(features, torch.ones(8), data["codes"])
-    actor_loss.backward()
-    assert all(p.grad is not None for p in module.actor.parameters())
-    assert all(p.grad is None for p in [*module.value.parameters(), *module.critic.parameters()])
+    judged = Judged(data, features, torch.linspace(-1, 1, 8), module.value(features).squeeze(-1))
+    networks = ("value", "critic", "target_critic", "actor")
+    for name, learning in {"value_loss": "value", "critic_loss": "critic", "actor_loss": "actor"}.items():
+        module.zero_grad()
+        loss, _ = getattr(module, name)(judged)
+        loss.backward(retain_graph=True)
+        for network in networks:
+            gradients = [p.grad for p in getattr(module, network).parameters()]
+            if network == learning:
+                assert all(gradient.abs().max() > 0 for gradient in gradients), (name, network)
+            else:
+                assert all(gradient is None for gradient in gradients), (name, network)
+
+
+def test_each_loss_is_its_equation_on_numbers_worked_by_hand():
+    module = small(tau=0.9, alpha=2.0, weight_clip=5.0)
+    data = {name: value[:2] for name, value in batch().items()} | {"codes": torch.tensor([1, 3])}
+    features = module.embed(data["observations"])
+    judged = Judged(data, features, torch.tensor([1.0, -1.0]), torch.tensor([0.5, 0.0]))
+    assert module.value_loss(judged)[0].item() == pytest.approx((0.9 * 0.25 + 0.1 * 1.0) / 2)
+    with torch.no_grad():
+        target = data["rewards"] + 0.9 * module.v(data["next_observations"])
+        q = module.critic(features.expand(2, -1, -1))[:, torch.arange(2), data["codes"]]  # (2, B)
+        assert module.critic_loss(judged)[0].item() == pytest.approx((q - target).square().mean(dim=1).sum().item())
+        log_pi = module.actor(features).log_softmax(dim=-1)[torch.arange(2), data["codes"]]
+        loss, statistics = module.actor_loss(judged)
+    weights = torch.tensor([math.e, math.exp(-2.0)])  # exp(2 x 0.5), exp(2 x -1)
+    assert loss.item() == pytest.approx(-(weights * log_pi).mean().item())
+    assert statistics["clipped_share"] == 0.0
+    total, terms = module.loss(data)
+    assert total.item() == pytest.approx(sum(terms[name].item() for name in ("value_loss", "q_loss", "actor_loss")))
 
 
 def test_one_adam_over_the_sum_equals_three_adams():
@@ -279,12 +301,36 @@ def test_settings_out_of_range_are_refused_by_name(settings, message):
         small(**settings)
 
 
-def test_fourier_features_and_layer_norm_keep_the_shapes():
+def test_layer_norm_makes_values_blind_to_the_scale_of_a_layer_and_fourier_features_are_sines_and_cosines():
     module = small(fourier_features=8, layer_norm=True)
     states = torch.randn(3, 2)
-    assert module.v(states).shape == (3,)
-    assert module.q(states).shape == (3, 4)
-    assert module.logits(states).shape == (3, 4)
+    values = module.v(states)
+    assert values.shape == (3,)
+    assert module.q(states).shape == module.logits(states).shape == (3, 4)
+    phase = states @ module.features.frequencies
+    torch.testing.assert_close(module.embed(states), torch.cat([states, phase.sin(), phase.cos()], dim=-1))
+    with torch.no_grad():
+        for parameter in module.value[0].parameters():
+            parameter.mul_(10.0)
+    torch.testing.assert_close(module.v(states), values, atol=1e-3, rtol=1e-3)
+
+
+def test_statistics_are_strict_for_the_user_and_filtered_from_a_data_module():
+    class Rich(Chain):
+        def statistics(self):
+            return {**super().statistics(), "episodes": 4}
+
+    class Poor(Chain):
+        def statistics(self):
+            return {"observation_mean": torch.zeros(5), "observation_std": torch.ones(5)}
+
+    module = small(observation_dim=5)
+    with pytest.raises(TypeError, match="max_discont"):
+        module.fit_statistics(**Chain().statistics(), max_discont=0.9)
+    fit(module, 1, Rich())
+    assert module.value_range.tolist() == pytest.approx([0.0, 10.0])
+    with pytest.raises(UserError, match=r"Poor.statistics\(\) lacks code_share, reward_range, max_discount"):
+        fit(small(observation_dim=5), 1, Poor())
 
 
 def test_fourier_features_may_see_the_position_alone():

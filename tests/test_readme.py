@@ -65,9 +65,22 @@ def test_python_blocks_are_valid_python():
         compile(block, "README.md", "exec")
 
 
-def test_own_arrays_become_data_of_a_task_as_shown():
+def test_a_robot_of_ones_own_gets_from_arrays_to_a_score_as_shown(capsys):
+    """The commands of the section, with a training of a few steps."""
     (block,) = [block for block in PYTHON if "from_episodes" in block]
     exec(compile(block, "README.md", "exec"), {})
-    data = load_trajectories("arrays:data/mine", "hopper-medium")
-    assert (data.num_steps, data.num_episodes) == (200, 1)
-    assert main(["data", "check", "data/mine", "--task", "hopper-medium"]) == 0
+    (text,) = re.findall(r"^```yaml\n# reacher.yaml\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL)
+    Path("reacher.yaml").write_text(text)
+    data = load_trajectories("arrays:data/reacher", "reacher.yaml")
+    assert (data.num_steps, data.num_episodes, data.observation_dim) == (2000, 40, 10)
+    check, run, evaluate = (words for words in DDS if "reacher" in " ".join(words))
+    assert main(check) == 0
+    few = ["--clone_steps=3", "--episodes=1", "--episodes_per_skill=1", "--workers=0", "--evaluate_every=0"]
+    few += [f"--{stage}.trainer.{name}" for stage in ("skill", "policy") for name in ("max_steps=3", "accelerator=cpu")]
+    few += ["--skill.model.hidden_dim=16", "--skill.model.num_skills=2", "--policy.model.hidden_dims=[16]"]
+    assert main([*run, *few]) == 0
+    Path("reacher.yaml").unlink()  # the run keeps its task
+    assert main([*evaluate[:-1], "1", "--workers=0"]) == 0
+    assert main(["publish", "runs/reacher", "agent"]) == 0
+    assert main(["evaluate", "agent", "--episodes=1", "--workers=0", "--json"]) == 0
+    assert '"task": "reacher"' in capsys.readouterr().out

@@ -9,7 +9,6 @@ import torch
 from torch.utils.data import DataLoader
 
 from dds_lightning.errors import UserError
-from dds_lightning.nn.codebook import Quantised
 from dds_lightning.skill import SkillModule
 
 SMALL = {
@@ -86,7 +85,7 @@ def test_every_combination_trains_every_parameter(encoder, decoder, bottleneck):
     module = small(encoder=encoder, decoder=decoder, bottleneck=bottleneck)
     loss, terms, skill = module.loss(segments(8))
     loss.backward()
-    assert [name for name, p in module.named_parameters() if p.grad is None] == []
+    assert [name for name, p in module.named_parameters() if not p.grad.abs().max() > 0] == []
     assert skill.vectors.shape == (8, 8)
     weights = {"denoising": 1.0, "codebook": 1.0, "commitment": 0.25, "kl": 0.01}
     assert loss.item() == pytest.approx(sum(weights[name] * term.item() for name, term in terms.items()))
@@ -222,5 +221,4 @@ def test_quantised_skills_of_a_batch_are_the_nearest_vectors():
     module = small()
     data = segments(8)
     skill = module.encode_segments(data["observations"], data["actions"])
-    assert isinstance(skill, Quantised)
     torch.testing.assert_close(skill.vectors, module.bottleneck.lookup(skill.codes))

@@ -1,4 +1,4 @@
-"""Behaviour policies: trained here by `python -m datamodules.behaviours.train`, shipped small, acting without torch."""
+"""Behaviour policies: trained by `python -m datamodules.behaviours.train`, shipped small, acting without torch."""
 
 from datamodules.behaviours.ant import AntController
 from datamodules.behaviours.policy import MLPPolicy

@@ -1,13 +1,13 @@
-"""An Ant that walks where it is told: what its policy sees, and the controller.
+"""An Ant that follows a commanded heading: what its policy observes, and the controller.
 
 Frames. The world frame is the simulator's: x, y on the floor, z up; headings are angles from +x towards +y in
 radians. (D4RL's mazes and gymnasium-robotics' are drawn with opposite y, which does not matter here: a heading is
-`atan2(dy, dx)` of the way to go, in the coordinates of the observation.) The body frame is the torso's. The yaw
-frame is the world frame turned about z until its x lies above the body's x.
+`atan2(dy, dx)` of the direction to walk in, in the coordinates of the observation.) The body frame is the torso's. The
+yaw frame is the world frame turned about z until its x lies above the body's x.
 
 Symmetry. The Ant looks the same after a quarter turn about its own z. So the policy only ever sees a body whose x
 points within 45 degrees of the heading: of the four ways to number its legs the best one is taken, and the actions
-are handed back to the legs they belong to. One gait then serves every direction, and nothing has to turn round.
+are mapped back to the real legs. One gait then serves every direction, and the Ant never has to turn round.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 
 
 def rotation_matrices(quaternions: Array) -> Array:
-    """(B, 3, 3) from (B, 4) w, x, y, z; columns are the body's axes in the world."""
+    """Rotation matrices (B, 3, 3) of quaternions (B, 4) w, x, y, z; columns are the body's axes in the world frame."""
     w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -46,16 +46,16 @@ def rotation_matrices(quaternions: Array) -> Array:
 
 
 def see(observations: Array, headings: Array) -> tuple[Array, NDArray[np.int64]]:
-    """What the policy sees, in the numbering of legs whose x is nearest to the heading.
+    """What the policy observes, in the numbering of legs whose x is nearest to the heading.
 
     Args:
-        observations: (B, 29).
-        headings: (B,) radians in the world frame.
+        observations: Array (B, 29), see `OBSERVATION_DIM`.
+        headings: Array (B,), radians in the world frame.
 
     Returns:
-        (B, 28): z; direction of gravity in the body frame (3); hips and ankles (4 + 4); linear velocity in the
+        Array (B, 28): z; direction of gravity in the body frame (3); hips and ankles (4 + 4); linear velocity in the
         yaw frame (3); angular velocity in the body frame (3); velocities of hips and ankles (4 + 4); cosine and
-        sine of the heading in the yaw frame (2). And (B,) the number of quarter turns, for `motor_actions`.
+        sine of the heading in the yaw frame (2). And the number of quarter turns (B,), for `motor_actions`.
     """
     rotation = rotation_matrices(observations[:, 3:7])
     towards = np.stack([np.cos(headings), np.sin(headings)], axis=1)
@@ -85,7 +85,7 @@ def see(observations: Array, headings: Array) -> tuple[Array, NDArray[np.int64]]
 
 
 def motor_actions(actions: ArrayLike, turns: NDArray[np.int64]) -> Array:
-    """Give actions (B, 8), hips then ankles in the policy's numbering, to the simulator's motors (B, 8)."""
+    """Map actions (B, 8), hips then ankles in the policy's numbering, to the simulator's motors (B, 8)."""
     actions = np.asarray(actions, dtype=np.float64)
     legs = (MOTOR_LEGS - turns[:, None]) % 4
     signs = ANKLE_SIGN[MOTOR_LEGS] * ANKLE_SIGN[legs]
@@ -96,7 +96,7 @@ def motor_actions(actions: ArrayLike, turns: NDArray[np.int64]) -> Array:
 
 
 def _turned(vectors: Array, turns: NDArray[np.int64]) -> Array:
-    """Vectors (B, 3) of the body frame after the body's axes moved on by quarter turns."""
+    """Vectors (B, 3) of the body frame after the body's axes advanced by quarter turns."""
     x, y = vectors[:, 0], vectors[:, 1]
     around = np.stack([x, y, -x, -y], axis=1)
     row = np.arange(len(turns))
@@ -111,31 +111,31 @@ def _in_frame(vectors: Array, forward: Array) -> Array:
 
 
 class AntController:
-    """Walks in commanded directions.
+    """A controller that walks in commanded directions.
 
     Args:
-        physics: "d4rl" (`dds/AntMazeD4RL_*`) or "robotics" (`AntMaze_*-v4`): the policy was trained in one.
-        directory: Where `<physics>.safetensors` lies; by default the repository's `checkpoints/behaviours/ant`.
+        physics: "d4rl" (`dds/AntMazeD4RL_*`) or "robotics" (`AntMaze_*-v4`), the physics it was trained in.
+        directory: The folder of `<physics>.safetensors`; by default the shipped one.
 
     Raises:
-        UserError: No such physics.
+        UserError: There is no such physics.
         DataError: The policy's file is missing or damaged.
     """
 
     def __init__(self, physics: str, directory: str | Path | None = None) -> None:
         if physics not in PHYSICS:
-            raise UserError(f"physics: found '{physics}', expected one of {', '.join(PHYSICS)}")
+            raise UserError(f"physics: got '{physics}', expected one of {', '.join(PHYSICS)}")
         self.policy = MLPPolicy.load(Path(directory or SHIPPED / "ant") / f"{physics}.safetensors")
 
     def act(self, observations: ArrayLike, headings: ArrayLike) -> Array:
-        """Actions that walk along the headings.
+        """Compute actions that walk along the headings.
 
         Args:
-            observations: (B, 29) qpos[:15] and qvel[:14], as AntMaze tasks have them.
-            headings: (B,) radians in the world frame, from +x towards +y.
+            observations: Array (B, 29): qpos[:15] and qvel[:14], as in AntMaze tasks.
+            headings: Array (B,), radians in the world frame, from +x towards +y.
 
         Returns:
-            (B, 8) in [-1, 1], in the simulator's order.
+            Array (B, 8) in [-1, 1], in the simulator's order.
         """
         seen, turns = see(np.asarray(observations, dtype=np.float64), np.asarray(headings, dtype=np.float64))
         return motor_actions(self.policy.act(seen), turns)

@@ -1,6 +1,6 @@
-"""The actor of a trained behaviour policy in NumPy: a file of a few kilobytes, no torch needed to act.
+"""The actor of a trained behaviour policy in NumPy: a file of a few kilobytes that acts without torch.
 
-Collectors run it in worker processes, where importing torch would cost a second and hundreds of megabytes each.
+Collectors run it in worker processes, where importing torch would cost a second and hundreds of megabytes in each.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from dds_lightning.saving.files import written_whole
 
 FORMAT = "1"
 OBSERVATION_CLIP = 10.0
-"""Normalised observations are cut here, in training and afterwards."""
+"""Normalised observations are clipped to +- this, in training and afterwards."""
 ACTIVATIONS = ("tanh", "relu")
 OUTPUTS = ("clip", "tanh")
 
@@ -31,15 +31,15 @@ class MLPPolicy:
     """A Gaussian policy whose mean is a multilayer perceptron of the normalised observation.
 
     Attributes:
-        weights: One (inputs, outputs) matrix a layer.
-        biases: One (outputs,) vector a layer.
-        mean: (O,) subtracted from observations.
-        std: (O,) divides them; the quotient is cut to +-10.
-        log_std: (A,) logarithm of the deviation with which the policy explored when it was saved, added before
-            `output`.
-        activation: Between layers: "tanh" or "relu".
+        weights: One (inputs, outputs) matrix per layer.
+        biases: One (outputs,) vector per layer.
+        mean: (O,), subtracted from observations.
+        std: (O,), divides the difference; the quotient is clipped to +-10.
+        log_std: (A,), logarithm of the standard deviation with which the policy explored when it was saved. The noise
+            is added before `output`.
+        activation: Activation between layers, "tanh" or "relu".
         output: How the last layer becomes an action in [-1, 1]: "clip" (PPO) or "tanh" (SAC).
-        metadata: What it was trained on: environment, algorithm, steps, score.
+        metadata: How it was trained: environment, algorithm, steps, score.
     """
 
     weights: tuple[Array, ...]
@@ -54,12 +54,12 @@ class MLPPolicy:
     def act(
         self, observations: ArrayLike, rng: np.random.Generator | None = None, *, noise_scale: float = 1.0
     ) -> Array:
-        """Actions of a batch.
+        """Compute actions for a batch.
 
         Args:
-            observations: (..., O).
-            rng: Draws from the policy as it explored in training; without one, its mean is taken.
-            noise_scale: Multiplies the deviation of that exploration.
+            observations: Array (..., O).
+            rng: Samples from the policy as it explored in training; None takes its mean.
+            noise_scale: Factor on the standard deviation of that exploration.
 
         Returns:
             (..., A) float32 in [-1, 1].
@@ -75,7 +75,7 @@ class MLPPolicy:
         return np.clip(x, -1.0, 1.0) if self.output == "clip" else np.tanh(x)
 
     def save(self, path: str | Path) -> Path:
-        """Write a safetensors file; `metadata` travels in its header as JSON."""
+        """Write a safetensors file, with `metadata` as JSON in its header; returns the path."""
         from safetensors.numpy import save_file
 
         tensors = {"mean": self.mean, "std": self.std, "log_std": self.log_std}
@@ -106,7 +106,7 @@ class MLPPolicy:
         try:
             with safe_open(path, framework="numpy") as file:
                 header = file.metadata() or {}
-                arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118, it is no mapping
+                arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a mapping
             metadata = json.loads(header.get("metadata", "{}"))
         except (OSError, SafetensorError, ValueError) as error:
             raise DataError(
@@ -126,13 +126,13 @@ class MLPPolicy:
             )
         except KeyError as error:
             raise DataError(
-                f"behaviour policy {path}: it has no {error}, expected a file that MLPPolicy.save wrote; train it again"
+                f"behaviour policy {path}: has no {error}, expected a file that MLPPolicy.save wrote; train it again"
             ) from error
         policy._check(header.get("format"), path)
         return policy
 
     def _check(self, version: str | None, path: Path) -> None:
-        """Refuse shapes that do not follow from each other, and words that mean nothing here."""
+        """Refuse shapes that do not fit together, and unknown settings."""
         if version != FORMAT or self.activation not in ACTIVATIONS or self.output not in OUTPUTS:
             raise DataError(
                 f"behaviour policy {path}: format {version}, activation '{self.activation}', output '{self.output}', "
@@ -145,7 +145,7 @@ class MLPPolicy:
         for weight, bias in zip(self.weights, self.biases, strict=True):
             if len(width) != 1 or weight.shape != (*width, *bias.shape):
                 raise DataError(
-                    f"behaviour policy {path}: a layer of shape {weight.shape} after width {width}, expected "
+                    f"behaviour policy {path}: got a layer of shape {weight.shape} after width {width}, expected "
                     "(inputs, outputs); train it again"
                 )
             width = bias.shape

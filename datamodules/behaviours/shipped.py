@@ -1,4 +1,4 @@
-"""Where the trained policies lie."""
+"""The trained policies that are shipped."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ SHIPPED = _PACKAGED if _PACKAGED.is_dir() else Path(__file__).resolve().parents[
 
 
 def load_ladder(behaviour: str, directory: str | Path | None = None) -> dict[str, MLPPolicy]:
-    """A runner's policies from random to expert.
+    """Load a runner's policies, from random to expert.
 
     Args:
         behaviour: "hopper", "walker2d" or "halfcheetah".
-        directory: The folder of ladders; by default the repository's `checkpoints/behaviours`.
+        directory: The folder of the ladders; by default the shipped one.
 
     Returns:
-        Name -> policy with rising scores, "000_random" first and "expert" last; `metadata["score"]` has each one's.
+        Policies by name, with rising scores: "000_random" first, "expert" last. `metadata["score"]` holds the score.
 
     Raises:
         UserError: There is no such ladder.
@@ -31,6 +31,6 @@ def load_ladder(behaviour: str, directory: str | Path | None = None) -> dict[str
     if not paths:
         raise UserError(
             f"behaviour: {folder} holds no policies; train them with python -m datamodules.behaviours.train and "
-            "publish them, or name another directory"
+            "publish them, or pass another directory"
         )
     return {path.stem: MLPPolicy.load(path) for path in paths}

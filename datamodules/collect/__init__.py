@@ -1,1 +1,1 @@
-"""Data made on the spot: planners, controllers, and the recorder that writes what they did."""
+"""Collects data: planners, controllers, and the recorder that writes what they did."""

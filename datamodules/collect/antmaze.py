@@ -1,10 +1,15 @@
-"""AntMaze data by D4RL's recipe: a planner over cells, a trained Ant that walks where it is told, noise on purpose."""
+"""AntMaze data by D4RL's recipe: a planner over cells, a trained Ant that walks in a given direction, and noise.
+
+Episodes of 1,000 steps: the ant walks to a goal, and once there to a new one. `diverse` tasks start and head anywhere,
+`play` tasks start anywhere and head for hand-picked cells, `antmaze-umaze` always goes from the start to the goal.
+Rewards are those of the evaluation goal, drawn anew for every episode as the evaluation draws it: 1 where a step leads
+to within 0.5 m of it.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -12,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.behaviours.ant import SHIPPED, AntController
-from datamodules.collect.collecting import place, record_set
+from datamodules.collect.collecting import Collector, DataSetPlan
 from datamodules.collect.recording import Episode
 from datamodules.collect.waypoints import Waypoints
 from dds_lightning.envs.build import build_env
@@ -21,9 +26,9 @@ from dds_lightning.saving.files import sha256
 from dds_lightning.tasks import Cell, Task, get_task
 
 BODIES = 16
-"""Ants that walk side by side in one process; belongs to the data, like the seed."""
+"""Ants that walk side by side in one process; the data depend on it, as on the seed."""
 FLIPPED_STEPS = 25
-"""An ant that lies on its back this long has fallen for good (it takes a few steps to roll over a leg)."""
+"""An ant that has lain on its back this long will not get up (rolling over a leg takes a few steps)."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +37,7 @@ class AntMazeRecipe:
 
     Attributes:
         action_noise: Standard deviation of the Gaussian noise on every action entry.
-        waypoint_noise: Waypoints lie up to this many metres beyond a cell's centre, on both axes, to one side.
+        waypoint_noise: Waypoints lie up to this many metres beyond a cell's centre on both axes, always to one side.
         episode_steps: Steps after which an episode is truncated.
         end_when_flipped: End an episode (truncation) when the ant has lain on its back for `FLIPPED_STEPS`;
             D4RL's episodes run on.
@@ -44,78 +49,31 @@ class AntMazeRecipe:
     end_when_flipped: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse what makes no sense."""
+        """Refuse settings out of range."""
         if not 0.0 <= self.action_noise < math.inf:
-            raise UserError(f"action_noise: found {self.action_noise}, expected a number of at least 0")
+            raise UserError(f"action_noise: got {self.action_noise}, expected a number of at least 0")
         if not 0.0 <= self.waypoint_noise <= 1.5:
-            raise UserError(f"waypoint_noise: found {self.waypoint_noise}, expected 0 to 1.5 metres")
+            raise UserError(f"waypoint_noise: got {self.waypoint_noise}, expected 0 to 1.5 metres")
         if self.episode_steps < 1:
-            raise UserError(f"episode_steps: found {self.episode_steps}, expected at least 1")
+            raise UserError(f"episode_steps: got {self.episode_steps}, expected at least 1")
 
 
-def collect_antmaze(
-    task: Task | str,
-    steps: int = 1_000_000,
-    seed: int = 0,
-    out: str | Path = "data",
-    workers: int | None = None,
-    *,
-    recipe: AntMazeRecipe | None = None,
-    dataset_id: str | None = None,
-    overwrite: bool = False,
-    progress: bool = True,
-) -> Path:
-    """Collect an AntMaze data set in D4RL's physics and write it as a Minari data set.
-
-    Episodes of 1,000 steps: the ant walks to a goal, and when it is there to a new one. `diverse` tasks start
-    and head anywhere, `play` tasks start anywhere and head for hand-picked cells, `antmaze-umaze` always goes
-    from the start to the goal. Rewards are those of the evaluation goal, drawn anew for every episode as the
-    evaluation draws it: 1 where a step leads to within 0.5 m of it. An interrupted call goes on where it
-    stopped when it is made again.
-
-    Args:
-        task: An AntMaze task (in D4RL's physics) or its name.
-        steps: Environment steps in all.
-        seed: Same seed, same bytes of every array, whatever the workers and interruptions.
-        out: Folder of data sets; the set becomes `out/<dataset_id>`, where MINARI_DATASETS_PATH=out finds it.
-        workers: Processes; None takes every core, 1 stays in this process.
-        recipe: What the behaviour does.
-        dataset_id: Name of the set; None takes the task's own, for example "antmaze-large-diverse-v0".
-        overwrite: Replace a set of the same name.
-        progress: Show a progress bar on standard error.
-
-    Returns:
-        The data set's folder; `load_trajectories(f"local:{folder}", task)` reads it.
-
-    Raises:
-        UserError: For a task that is no AntMaze in D4RL's physics, a number out of range, or a folder that
-            exists.
-    """
-    task = get_task(task) if isinstance(task, str) else task
-    recipe = recipe or AntMazeRecipe()
-    if task.family != "antmaze" or task.physics != "d4rl":
-        raise UserError(f"task: '{task.name}' is no AntMaze in D4RL's physics, and this collector knows only those")
-    folder = place(task, steps, seed, out, dataset_id, overwrite)
+def _plan(task: Task, seed: int, steps: int, recipe: AntMazeRecipe) -> DataSetPlan:
     recorder = _Recorder(task, seed, steps, recipe)
-    controller = sha256(SHIPPED / "ant" / f"{task.physics}.safetensors")
-    return record_set(
-        folder,
+    return DataSetPlan(
         recorder,
         recorder.env(),
-        {"task": task.name, "seed": seed, "steps": steps, **asdict(recipe), "controller": controller},
-        observation_space=gym.spaces.Box(-np.inf, np.inf, (task.observation_dim,), np.float32),
+        gym.spaces.Box(-np.inf, np.inf, (task.observation_dim,), np.float32),
         algorithm="shortest path over cells, heading-conditioned Ant controller",
         description=_description(task, seed, recipe),
-        workers=workers,
-        overwrite=overwrite,
-        progress=progress,
+        settings={"controller": sha256(SHIPPED / "ant" / f"{task.physics}.safetensors")},
     )
 
 
 class _Recorder:
-    """Records round i of a data set: some bodies walk side by side, so that the controller acts in one batch.
+    """Records round i of a data set: bodies walk side by side, so that the controller acts in one batch.
 
-    Everything about a round follows from (seed, i).
+    A round depends on (seed, i) alone.
     """
 
     def __init__(self, task: Task, seed: int, steps: int, recipe: AntMazeRecipe) -> None:
@@ -148,18 +106,18 @@ class _Recorder:
 
 
 class _Walk:
-    """One body on its way for a number of steps, in one episode or, where some end early, in more."""
+    """One body that walks a number of steps, in one episode, or in more where some end early."""
 
     def __init__(self, task: Task, recipe: AntMazeRecipe, env: Any, rng: np.random.Generator, steps: int) -> None:
         self.task, self.recipe, self.env, self.rng, self.left = task, recipe, env, rng, steps
         self.waypoints = Waypoints(task)
-        # With one goal there is nowhere else to go: the episode ends there, as in D4RL's `antmaze-umaze`.
+        # With a single goal there is no next one: the episode ends there, as in D4RL's `antmaze-umaze`.
         self.ends_at_goal = len(task.data_goal_cells or ()) == 1
         self.episodes: list[Episode] = []
         self._begin()
 
     def _begin(self) -> None:
-        """Start an episode that may take all the steps that are left."""
+        """Start an episode that may take all of the remaining steps."""
         task, recipe, env, length = self.task, self.recipe, self.env, self.left
         env.reset(seed=int(self.rng.integers(2**31)))
         self.evaluation_goal = env.goal.copy()
@@ -175,14 +133,14 @@ class _Walk:
         self.observations[0], self.goals[0] = self.state, self.goal
 
     def heading(self) -> float:
-        """Where to walk now, in radians."""
+        """Direction to walk in now, in radians."""
         x, y = float(self.state[0]), float(self.state[1])
         offset = self.offsets[self.t]
         target_x, target_y = self.waypoints.target(x, y, self.goal, (offset[0], offset[1]))
         return math.atan2(target_y - y, target_x - x)
 
     def step(self, action: NDArray[np.float64]) -> None:
-        """Act once, with noise; where the episode ends, begin the next."""
+        """Act once, with noise; begin the next episode where this one ends."""
         self.actions[self.t] = np.clip(action + self.noise[self.t], -1.0, 1.0)
         self.state = self.env.step(self.actions[self.t])[0]
         self.t, self.left = self.t + 1, self.left - 1
@@ -216,7 +174,7 @@ class _Walk:
         }
 
     def _placed(self, cell: Cell) -> NDArray[np.float64]:
-        """Move the body from the start cell to another, with the noise that the reset gave it."""
+        """Move the body from the start cell to another, keeping the noise of the reset."""
         data = self.env.data
         qpos = data.qpos.copy()
         qpos[:2] += self.task.cell_to_xy(cell)  # the start cell is the origin
@@ -224,7 +182,7 @@ class _Walk:
         return np.concatenate([data.qpos[:15], data.qvel[:14]])
 
     def _new_goal(self) -> tuple[float, float]:
-        """A goal in another cell than the body's, with the evaluation's noise."""
+        """A goal in a cell other than the body's, with the evaluation's noise."""
         here = tuple(self.task.xy_to_cell(self.state[:2]).tolist())
         cells = self.task.data_goal_cells or self.task.free_cells()
         elsewhere = [cell for cell in cells if self.ends_at_goal or cell != here]
@@ -251,50 +209,60 @@ def _description(task: Task, seed: int, recipe: AntMazeRecipe) -> str:
 
 
 class AntNavigator:
-    """The behaviour as an actor: walks every ant of a batch to the task's goal cell, and about in it.
-
-    `codes` is None: this actor chooses no skills.
-    """
+    """The behaviour as an actor: walks every ant of a batch to the task's goal cell, and around in it."""
 
     def __init__(self, task: Task | str, recipe: AntMazeRecipe | None = None) -> None:
         """Prepare for `task`; without a recipe the controller is at its best, without noise on actions."""
-        self.task = get_task(task) if isinstance(task, str) else task
+        self.task = get_task(task)
         self.recipe = recipe or AntMazeRecipe(action_noise=0.0)
         self.controller = AntController("d4rl")
-        self.codes: NDArray[np.int64] | None = None
         self.reset()
 
     def reset(self, num_envs: int = 1, seed: int | None = None) -> None:
-        """Forget everything and prepare for `num_envs` environments; `seed` fixes the noise."""
+        """Prepare for new episodes in `num_envs` environments; `seed` fixes the noise."""
         self._rng = np.random.default_rng(seed)
+        # Goals are drawn whenever one is reached: a stream for each environment keeps the others' draws in place.
+        self._goal_rngs = self._rng.spawn(num_envs)
         self._ways = [Waypoints(self.task) for _ in range(num_envs)]
-        self._goals = [self._goal() for _ in range(num_envs)]
+        self._goals = [self._goal(rng) for rng in self._goal_rngs]
 
-    def _goal(self) -> tuple[float, float]:
-        """Somewhere among the evaluation's goals, which an actor is not shown."""
+    def _goal(self, rng: np.random.Generator) -> tuple[float, float]:
+        """A position among the evaluation's goals, which an actor does not observe."""
         assert self.task.goal_cell is not None
-        return _goal_near(self.task, self.task.goal_cell, self._rng)
+        return _goal_near(self.task, self.task.goal_cell, rng)
 
-    def act(self, observations: NDArray[np.float32], restarted: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
-        """Actions for a batch.
+    def act(
+        self,
+        observations: NDArray[np.float32],
+        restarted: NDArray[np.bool_] | None = None,
+        rows: NDArray[np.intp] | None = None,
+    ) -> NDArray[np.float32]:
+        """As `Actor.act`.
 
         Args:
-            observations: (E, 29).
-            restarted: (E,) True where an episode has just begun.
+            observations: (n, 29).
+            restarted: (n,) True where an episode has just begun; None means nowhere.
+            rows: (n,) their environments; None means all of them.
 
         Returns:
-            (E, 8) in the box.
+            (n, 8) in the box.
         """
-        headings = np.empty(len(observations))
-        offsets = (self._rng.uniform(0.0, 1.0, (len(observations), 2)) * self.recipe.waypoint_noise).tolist()
-        for e, (x, y) in enumerate(observations[:, :2].tolist()):
-            if restarted is not None and restarted[e]:
-                self._ways[e].forget()
-            if math.hypot(x - self._goals[e][0], y - self._goals[e][1]) <= self.task.goal_radius:
-                self._goals[e] = self._goal()
-            offset_x, offset_y = offsets[e]
-            target_x, target_y = self._ways[e].target(x, y, self._goals[e], (offset_x, offset_y))
-            headings[e] = math.atan2(target_y - y, target_x - x)
+        every = len(self._ways)
+        rows = np.arange(every) if rows is None else rows
+        headings = np.empty(len(rows))
+        offsets = self._rng.uniform(0.0, 1.0, (every, 2))[rows] * self.recipe.waypoint_noise
+        for i, (row, (x, y)) in enumerate(zip(rows.tolist(), observations[:, :2].tolist(), strict=True)):
+            if restarted is not None and restarted[i]:
+                self._ways[row].forget()
+            if math.hypot(x - self._goals[row][0], y - self._goals[row][1]) <= self.task.goal_radius:
+                self._goals[row] = self._goal(self._goal_rngs[row])
+            offset_x, offset_y = offsets[i].tolist()
+            target_x, target_y = self._ways[row].target(x, y, self._goals[row], (offset_x, offset_y))
+            headings[i] = math.atan2(target_y - y, target_x - x)
         actions = self.controller.act(observations, headings)
-        noise = self.recipe.action_noise * self._rng.standard_normal(actions.shape)
+        noise = self.recipe.action_noise * self._rng.standard_normal((every, actions.shape[1]))[rows]
         return np.clip(actions + noise, -1.0, 1.0).astype(np.float32)
+
+
+COLLECTOR = Collector("antmaze", "d4rl", 1_000_000, AntMazeRecipe, _plan, AntNavigator)
+collect_antmaze = COLLECTOR.collect

@@ -1,8 +1,8 @@
-"""The behaviour that makes PointMaze data: planned waypoints, a velocity controller, and noise on purpose.
+"""The behaviour behind PointMaze data: planned waypoints, a velocity controller, and noise on purpose.
 
 Coverage decides what can be learnt. A controller that always drives well never shows the learner a wall, a
-dead end or a body at rest, and a value network that has not seen them believes that goals are near as the
-crow flies.
+dead end or a body at rest, and a value network that has not seen them judges goals by their straight-line
+distance.
 """
 
 from __future__ import annotations
@@ -18,10 +18,12 @@ from dds_lightning.tasks import Task
 
 
 @dataclass(frozen=True)
-class BehaviourNoise:
-    """How far the behaviour strays; the defaults are those of `collect_pointmaze`.
+class PointMazeRecipe:
+    """How PointMaze data are made.
 
     Attributes:
+        episode_steps: Steps after which an episode is truncated (the last one may be shorter).
+        speed: Cruising speed in metres a second; the environment stops at 5 on each axis.
         waypoint_offset: Waypoints lie up to this far from a cell's centre, in cells, on both axes.
         action_noise: Standard deviation of the Gaussian noise on every action entry.
         burst_probability: Chance that a step outside a burst starts one.
@@ -32,6 +34,8 @@ class BehaviourNoise:
         start_offset: Episodes start up to this far from a cell's centre, in cells, at rest.
     """
 
+    episode_steps: int = 500
+    speed: float = 4.5
     waypoint_offset: float = 0.35
     action_noise: float = 0.2
     burst_probability: float = 0.008
@@ -40,34 +44,41 @@ class BehaviourNoise:
     start_offset: float = 0.38
 
     def __post_init__(self) -> None:
-        """Refuse what makes no sense."""
+        """Refuse settings out of range."""
+        if self.episode_steps < 1:
+            raise UserError(f"episode_steps: got {self.episode_steps}, expected at least 1")
+        if not 0 < self.speed <= 5:
+            raise UserError(f"speed: got {self.speed}, expected more than 0 and at most 5 metres a second")
         for name in ("waypoint_offset", "start_offset"):
             value = getattr(self, name)
             if not 0.0 <= value <= 0.4:
-                raise UserError(f"{name}: found {value}, expected 0 to 0.4 cells; beyond that lies the wall")
+                raise UserError(f"{name}: got {value}, expected 0 to 0.4 cells, beyond which there may be a wall")
         if not 0.0 <= self.action_noise < math.inf:
-            raise UserError(f"action_noise: found {self.action_noise}, expected a number of at least 0")
+            raise UserError(f"action_noise: got {self.action_noise}, expected a number of at least 0")
         if not 0.0 <= self.burst_probability <= 1.0:
-            raise UserError(f"burst_probability: found {self.burst_probability}, expected 0 to 1")
+            raise UserError(f"burst_probability: got {self.burst_probability}, expected 0 to 1")
         if not 0.0 <= self.rest_share <= 1.0:
-            raise UserError(f"rest_share: found {self.rest_share}, expected 0 to 1")
+            raise UserError(f"rest_share: got {self.rest_share}, expected 0 to 1")
         low, high = self.burst_steps
         if not 1 <= low <= high:
-            raise UserError(f"burst_steps: found {self.burst_steps}, expected 1 <= shortest <= longest")
+            raise UserError(f"burst_steps: got {self.burst_steps}, expected 1 <= shortest <= longest")
 
 
-QUIET = BehaviourNoise(waypoint_offset=0.0, action_noise=0.0, burst_probability=0.0, start_offset=0.0)
+BehaviourNoise = PointMazeRecipe
+"""Name in earlier versions."""
+
+QUIET = PointMazeRecipe(waypoint_offset=0.0, action_noise=0.0, burst_probability=0.0, start_offset=0.0)
 """No noise at all: the controller at its best."""
 
 REST = (0.0, 0.0)
-"""Stands in a plan of bursts for braking, whose force depends on the velocity."""
+"""Marks braking in a plan of bursts; its force depends on the velocity."""
 
 
 class Driver:
     """Drives one point mass towards one goal at a time.
 
-    Everything random is drawn once an episode, before the first step; a step is then a few Python floats,
-    which is cheaper than NumPy on two numbers and makes an episode a function of its seed alone.
+    Everything random is drawn once an episode, before the first step. A step then computes with a few Python floats,
+    which is faster than NumPy on two numbers, and an episode depends on its seed alone.
     """
 
     def __init__(self, task: Task, *, speed: float = 4.5, gain: float = 0.5) -> None:
@@ -76,17 +87,17 @@ class Driver:
         Args:
             task: A maze task whose actions are forces on x and y.
             speed: Cruising speed in metres a second; the environment stops at 5 on each axis.
-            gain: Action for one metre a second of velocity error.
+            gain: Action per metre a second of velocity error.
         """
         self.waypoints = Waypoints(task)
         self.speed, self.gain = speed, gain
         self.start_episode(np.random.default_rng(0), 1, QUIET)
 
-    def start_episode(self, rng: np.random.Generator, steps: int, noise: BehaviourNoise) -> None:
+    def start_episode(self, rng: np.random.Generator, steps: int, recipe: PointMazeRecipe) -> None:
         """Draw an episode's noise: action noise, bursts, waypoint offsets; after `steps` it repeats."""
-        self._noise = (noise.action_noise * rng.standard_normal((steps, 2))).tolist()
-        self._burst = _bursts(rng, steps, noise)
-        offsets = rng.uniform(-noise.waypoint_offset, noise.waypoint_offset, (steps, 2)) * self.waypoints.size
+        self._noise = (recipe.action_noise * rng.standard_normal((steps, 2))).tolist()
+        self._burst = _bursts(rng, steps, recipe)
+        offsets = rng.uniform(-recipe.waypoint_offset, recipe.waypoint_offset, (steps, 2)) * self.waypoints.size
         self._offsets = list(map(tuple, offsets.tolist()))
         self._step = 0
         self.waypoints.forget()
@@ -109,24 +120,24 @@ class Driver:
         return min(max(force_x, -1.0), 1.0), min(max(force_y, -1.0), 1.0)
 
 
-def _bursts(rng: np.random.Generator, steps: int, noise: BehaviourNoise) -> list[tuple[float, float] | None]:
+def _bursts(rng: np.random.Generator, steps: int, recipe: PointMazeRecipe) -> list[tuple[float, float] | None]:
     """Steps of an episode at which a random action replaces the controller's, and that action.
 
     A share of `rest_share` brings the body to rest; of the others half hold one force (they press the body
     against walls) and half draw a new one at every step.
     """
     plan: list[tuple[float, float] | None] = [None] * steps
-    if noise.burst_probability <= 0:
+    if recipe.burst_probability <= 0:
         return plan
-    low, high = noise.burst_steps
-    step = int(rng.geometric(noise.burst_probability)) - 1
+    low, high = recipe.burst_steps
+    step = int(rng.geometric(recipe.burst_probability)) - 1
     while step < steps:
         length = int(rng.integers(low, high + 1))
         forces = rng.uniform(-1.0, 1.0, (length, 2))
         if rng.random() < 0.5:
             forces[:] = forces[0]
-        rest = rng.random() < noise.rest_share
+        rest = rng.random() < recipe.rest_share
         for k, (fx, fy) in enumerate(forces.tolist()[: steps - step]):
             plan[step + k] = REST if rest else (fx, fy)
-        step += length + int(rng.geometric(noise.burst_probability)) - 1
+        step += length + int(rng.geometric(recipe.burst_probability)) - 1
     return plan

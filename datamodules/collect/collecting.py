@@ -1,88 +1,155 @@
-"""What every collector does around its recorder: check what was asked for, record, write the set."""
+"""How data are made for a family of tasks: one `Collector` record; everything around its recorder is the same."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata as installed
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec
 
 from datamodules.collect.minari_writer import write_minari
-from datamodules.collect.recording import Episode, EpisodeRecorder, Kept, record
+from datamodules.collect.recording import Episode, EpisodeRecorder, PartialRecording, record
 from datamodules.storage import refuse_existing
 from dds_lightning.errors import UserError
-from dds_lightning.tasks import Task
+from dds_lightning.tasks import Task, get_task
 
 
-def place(task: Task, steps: int, seed: int, out: str | Path, dataset_id: str | None, overwrite: bool) -> Path:
-    """The folder of the set to come.
+@dataclass(frozen=True)
+class DataSetPlan:
+    """What differs from one collected data set to the next.
 
-    Raises:
-        UserError: A number is out of range, or the folder exists and may not be replaced.
-    """
-    if steps < 1:
-        raise UserError(f"steps: found {steps}, expected at least 1")
-    if seed < 0:
-        raise UserError(f"seed: found {seed}, expected at least 0")
-    folder = Path(out) / (dataset_id or task.data_ids["local"])
-    refuse_existing(folder, overwrite)
-    return folder
-
-
-def record_set(
-    folder: Path,
-    recorder: EpisodeRecorder,
-    env: gym.Env[Any, Any],
-    settings: Mapping[str, Any],
-    *,
-    observation_space: gym.Space[Any],
-    algorithm: str,
-    description: str,
-    workers: int | None,
-    overwrite: bool,
-    progress: bool,
-    shorten: Callable[[Iterator[Episode]], Iterator[Episode]] = iter,
-) -> Path:
-    """Record a set and write it; an interrupted call with the same settings goes on where it stopped.
-
-    Args:
-        folder: Where `place` says.
-        recorder: What records it.
+    Attributes:
+        recorder: Records the episodes.
         env: The recorded environment, made by its id.
-        settings: Everything that the data depend on; kept in the set's metadata as `collection`.
         observation_space: Of the stored observations.
         algorithm: Minari's `algorithm_name`.
         description: Minari's `description`.
-        workers: Processes; None takes every core.
-        overwrite: Replace a set of the same name.
-        progress: Show a progress bar on standard error.
-        shorten: Gives up what was recorded beyond the set's end.
-
-    Returns:
-        `folder`.
+        settings: What the data depend on beside task, seed, steps and recipe.
+        env_spec: Minari's `env_spec`; None takes that of `env`.
+        evaluation: Minari's `eval_env_spec`; None leaves it out.
+        packages: Packages whose installed versions are kept in the metadata.
+        chunk: Rounds that a worker records at once.
+        trim: Drops the episodes that were recorded beyond the end of the set.
     """
-    kept = Kept(folder, settings)
-    title = f"collecting {folder.name}" if progress else None
-    episodes = shorten(record(recorder, workers, parcel=1, kept=kept, title=title))
-    assert env.spec is not None, "made by its id"
-    packages = ("gymnasium", "gymnasium-robotics", "mujoco")
-    write_minari(
-        folder.parent,
-        folder.name,
-        episodes,
-        env_spec=env.spec,
-        observation_space=observation_space,
-        action_space=env.action_space,
-        overwrite=overwrite,
-        metadata={
-            "author": ["dds-lightning"],
-            "algorithm_name": algorithm,
-            "description": description,
-            "requirements": [f"{package}=={installed.version(package)}" for package in packages],
-            "collection": dict(settings),
-        },
-    )
-    kept.remove()
+
+    recorder: EpisodeRecorder
+    env: gym.Env[Any, Any]
+    observation_space: gym.Space[Any]
+    algorithm: str
+    description: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    env_spec: EnvSpec | None = None
+    evaluation: EnvSpec | None = None
+    packages: tuple[str, ...] = ("gymnasium", "gymnasium-robotics", "mujoco")
+    chunk: int = 1
+    trim: Callable[[Iterator[Episode]], Iterator[Episode]] = iter
+
+
+@dataclass(frozen=True)
+class Collector:
+    """How the data of a family of tasks are made, and the behaviour that makes them as an actor.
+
+    Attributes:
+        family: Of the tasks that it serves.
+        physics: Of the tasks that it serves; None serves all.
+        steps: Environment steps of a set unless another number is given.
+        recipe: Dataclass of what the behaviour does; every field has a default.
+        plan: What to record for (task, seed, steps, recipe).
+        controller: The behaviour as an `Actor`, for (task, recipe).
+    """
+
+    family: str
+    physics: str | None
+    steps: int
+    recipe: type[Any]
+    plan: Callable[[Task, int, int, Any], DataSetPlan]
+    controller: Callable[[Task, Any], Any]
+
+    def collect(
+        self,
+        task: Task | str,
+        steps: int | None = None,
+        seed: int = 0,
+        out: str | Path = "data",
+        workers: int | None = None,
+        *,
+        recipe: Any = None,
+        dataset_id: str | None = None,
+        overwrite: bool = False,
+        progress: bool = True,
+        **settings: Any,
+    ) -> Path:
+        """Collect a data set and write it as a Minari data set.
+
+        An interrupted call with the same arguments continues where it stopped.
+
+        Args:
+            task: A task that this collector serves, or its name.
+            steps: Environment steps in all; None takes the collector's own number.
+            seed: The same seed gives the same bytes of every array, whatever the workers and interruptions.
+            out: Folder of data sets; the set becomes `out/<dataset_id>`, where MINARI_DATASETS_PATH=out finds it.
+            workers: Processes; None takes every core, 1 stays in this process.
+            recipe: What the behaviour does, an instance of the collector's recipe class; None takes its defaults.
+            dataset_id: Name of the set; None takes the task's own, for example "pointmaze-large-diverse-v0".
+            overwrite: Replace a set of the same name.
+            progress: Show a progress bar on standard error.
+            **settings: Fields of the recipe that differ from `recipe`.
+
+        Returns:
+            The data set's folder; `load_trajectories(f"local:{folder}", task)` reads it.
+
+        Raises:
+            UserError: For a task that this collector does not serve, a number out of range, or a folder that exists.
+        """
+        task = get_task(task)
+        if task.family != self.family or self.physics not in (None, task.physics):
+            physics = f" in {self.physics} physics" if self.physics else ""
+            raise UserError(f"task: '{task.name}' cannot be collected here, expected a task of {self.family}{physics}")
+        recipe = replace(recipe or self.recipe(), **settings)
+        steps = self.steps if steps is None else steps
+        folder = prepare_folder(task, steps, seed, out, dataset_id, overwrite)
+        plan = self.plan(task, seed, steps, recipe)
+        collection = {"task": task.name, "seed": seed, "steps": steps, **asdict(recipe), **plan.settings}
+        partial = PartialRecording(folder, collection)
+        title = f"collecting {folder.name}" if progress else None
+        episodes = plan.trim(record(plan.recorder, workers, chunk=plan.chunk, partial=partial, title=title))
+        env_spec = plan.env_spec or plan.env.spec
+        assert env_spec is not None, "environments are made by their id"
+        write_minari(
+            folder.parent,
+            folder.name,
+            episodes,
+            env_spec=env_spec,
+            observation_space=plan.observation_space,
+            action_space=plan.env.action_space,
+            overwrite=overwrite,
+            metadata={
+                "author": ["dds-lightning"],
+                "algorithm_name": plan.algorithm,
+                "description": plan.description,
+                **({"eval_env_spec": plan.evaluation.to_json()} if plan.evaluation else {}),
+                "requirements": [f"{package}=={installed.version(package)}" for package in plan.packages],
+                "collection": collection,
+            },
+        )
+        partial.remove()
+        return folder
+
+
+def prepare_folder(task: Task, steps: int, seed: int, out: str | Path, dataset_id: str | None, overwrite: bool) -> Path:
+    """The folder of the set to come.
+
+    Raises:
+        UserError: When a number is out of range, or the folder exists and may not be replaced.
+    """
+    if steps < 1:
+        raise UserError(f"steps: got {steps}, expected at least 1")
+    if seed < 0:
+        raise UserError(f"seed: got {seed}, expected at least 0")
+    folder = Path(out) / (dataset_id or task.data_ids["local"])
+    refuse_existing(folder, overwrite)
     return folder

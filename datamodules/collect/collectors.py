@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 import importlib
-import inspect
 import json
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dds_lightning.errors import UserError
-from dds_lightning.tasks import Task, get_task
+from dds_lightning.tasks import Task, get_task, known_task
+
+if TYPE_CHECKING:
+    from datamodules.collect.collecting import Collector
 
 COLLECTORS = {
-    ("pointmaze", ""): ("datamodules.collect.pointmaze", "collect_pointmaze", None),
-    ("antmaze", "d4rl"): ("datamodules.collect.antmaze", "collect_antmaze", "AntMazeRecipe"),
-    ("locomotion", "v4"): ("datamodules.collect.locomotion", "collect_locomotion", "LocomotionRecipe"),
-    ("kitchen", ""): ("datamodules.collect.kitchen", "collect_kitchen", "KitchenRecipe"),
+    ("pointmaze", ""): "datamodules.collect.pointmaze",
+    ("antmaze", "d4rl"): "datamodules.collect.antmaze",
+    ("locomotion", "v4"): "datamodules.collect.locomotion",
+    ("kitchen", ""): "datamodules.collect.kitchen",
 }
-"""Family and physics -> module, function `(task, steps, seed, out, workers, *, dataset_id, overwrite)`, and the class
-of its `recipe`; None where what a recipe would hold are the function's own keywords."""
+"""Family and physics -> the file whose `COLLECTOR` makes the data, imported when it is used. A new collector is one
+file and one entry."""
 
 
 def can_collect(task: Task) -> bool:
@@ -29,11 +31,17 @@ def can_collect(task: Task) -> bool:
     return (task.family, task.physics) in COLLECTORS
 
 
+def collector_of(task: Task) -> Collector | None:
+    """The collector for a task's family and physics; None where there is none."""
+    module = COLLECTORS.get((task.family, task.physics))
+    return importlib.import_module(module).COLLECTOR if module else None
+
+
 def refuse_uncollectable(task: Task) -> None:
     """Say where data come from for a task that cannot be collected.
 
     Raises:
-        UserError: There is no collector for the task's family and physics.
+        UserError: When there is no collector for the task's family and physics.
     """
     if not can_collect(task):
         known = ", ".join(f"{family}-...{f'@{physics}' if physics else ''}" for family, physics in COLLECTORS)
@@ -62,7 +70,7 @@ def collect(
         seed: The same seed gives the same bytes of every array.
         out: Folder of data sets.
         workers: Processes; None takes every core.
-        recipe: What the behaviour shall do otherwise than by default, for example `{"action_noise": 0.1}`.
+        recipe: Settings of the behaviour that differ from the defaults, for example `{"action_noise": 0.1}`.
         dataset_id: Name of the set; None takes the task's own.
         overwrite: Replace a set of the same name.
 
@@ -70,49 +78,44 @@ def collect(
         The data set's folder, for `local:`.
 
     Raises:
-        UserError: There is no collector for the task's family, or the collector refuses its arguments.
+        UserError: When there is no collector for the task's family, or the collector refuses its arguments.
     """
-    task = get_task(task) if isinstance(task, str) else task
+    task = get_task(task)
     refuse_uncollectable(task)
-    collector, recipe_class, known = _collector(task)
-    for name, value in (recipe or {}).items():
+    collector, settings = collector_of(task), dict(recipe or {})
+    assert collector is not None
+    known = [one.name for one in fields(collector.recipe)]
+    for name, value in settings.items():
         if name not in known:
             raise UserError(f"recipe.{name}: '{task.name}' has no such setting; it has {', '.join(known)}")
         if not isinstance(value, bool | int | float):
-            raise UserError(f"recipe.{name}: found {value!r}, expected a number, true or false")
-    options = dict(recipe or {})
-    if recipe and recipe_class:
-        options = {"recipe": recipe_class(**recipe)}
-    return collector(task, steps, seed, out, workers, **options, dataset_id=dataset_id, overwrite=overwrite)
-
-
-def _collector(task: Task) -> tuple[Callable[..., Path], Any, dict[str, Any]]:
-    """A task's collector, the class of its recipe or None, and the settings of its behaviour with their defaults."""
-    module_name, name, recipe_name = COLLECTORS[task.family, task.physics]
-    module = importlib.import_module(module_name)
-    collector, recipe_class = getattr(module, name), getattr(module, recipe_name) if recipe_name else None
-    if recipe_class:
-        return collector, recipe_class, {field.name: field.default for field in fields(recipe_class)}
-    about_the_set = ("dataset_id", "overwrite", "progress")
-    keywords = [p for p in inspect.signature(collector).parameters.values() if p.kind is p.KEYWORD_ONLY]
-    return collector, None, {p.name: p.default for p in keywords if p.name not in about_the_set}
+            raise UserError(f"recipe.{name}: got {value!r}, expected a number, true or false")
+    return collector.collect(task, steps, seed, out, workers, dataset_id=dataset_id, overwrite=overwrite, **settings)
 
 
 def collection_command(folder: str | Path) -> str | None:
-    """The command that makes a collected data set again, as its metadata tell; None for a set made otherwise.
+    """The command that makes a collected data set again, from its metadata; None for a set made otherwise.
 
     Args:
         folder: Of the data set, as in `local:FOLDER`.
     """
     try:
-        told = json.loads((Path(folder) / "data" / "metadata.json").read_text(encoding="utf-8"))["collection"]
-        task, steps, seed = get_task(told["task"]), int(told["steps"]), int(told["seed"])
-        _, _, settings = _collector(task)
+        made = json.loads((Path(folder) / "data" / "metadata.json").read_text(encoding="utf-8"))["collection"]
+        task, steps, seed = known_task(str(made["task"])), int(made["steps"]), int(made["seed"])
     except (OSError, ValueError, KeyError, TypeError, UserError):
         return None
-    words = ["dds", "data", "collect", task.name, f"--steps={steps}", f"--seed={seed}"]
-    for name, default in settings.items():
-        value = told.get(name, default)
-        if value != default and isinstance(value, bool | int | float):
-            words.append(f"--recipe.{name}={value}")
-    return shlex.join(words)
+    collector = collector_of(task)
+    if collector is None:
+        return None
+    arguments = ["dds", "data", "collect", task.name, f"--steps={steps}", f"--seed={seed}"]
+    for setting in fields(collector.recipe):
+        value = made.get(setting.name, setting.default)
+        if value != setting.default and isinstance(value, bool | int | float):
+            arguments.append(f"--recipe.{setting.name}={value}")
+    return shlex.join(arguments)
+
+
+def behaviour_actor(task: Task) -> Any:
+    """The behaviour that makes a task's data, as an `Actor` with the noise that it has there; None if there is none."""
+    collector = collector_of(task)
+    return collector.controller(task, collector.recipe()) if collector else None

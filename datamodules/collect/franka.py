@@ -1,4 +1,4 @@
-"""The kitchen's Franka arm: where its fingers are, and the actions that move them where they should be.
+"""The kitchen's Franka arm: where its fingers are, and the actions that move them to where they should be.
 
 ```
     aim ──► hand's velocity ──► joint velocities ──────────────────► actions
@@ -20,10 +20,10 @@ from numpy.typing import ArrayLike, NDArray
 Vector = NDArray[np.float64]
 
 GRASP_DEPTH = 0.03
-"""The point that is steered lies this far (m) in front of the site `end_effector`, between the finger pads."""
+"""Distance (m) of the steered point, between the finger pads, in front of the site `end_effector`."""
 
 OPEN, CLOSED = 0.04, 0.0
-"""Finger openings (m, each finger): all the way, and shut with all the force there is."""
+"""Finger openings (m, each finger): fully open, and closed with full force."""
 
 FULL_ACTION = 2.0
 """rad/s (m/s for fingers) that an action of 1 asks for."""
@@ -57,13 +57,13 @@ class Aim:
 
 
 class FrankaArm:
-    """Kinematics and inverse dynamics of the arm, computed from positions alone in a scene of its own."""
+    """Kinematics and inverse dynamics of the arm, computed from positions only, in a separate scene."""
 
     def __init__(self, model: mujoco.MjModel, step_seconds: float) -> None:
         """Prepare for a model of the kitchen.
 
         Args:
-            model: Of `FrankaKitchen-v1`; it is only read.
+            model: Model of `FrankaKitchen-v1`; it is not changed.
             step_seconds: Duration of an environment step.
         """
         self.model, self.step_seconds = model, step_seconds
@@ -73,15 +73,15 @@ class FrankaArm:
         self._stiffness = model.actuator_gainprm[:7, 0].copy()
         self._gravity = np.zeros(model.nv)
         self._linear, self._angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
-        # Offset of the servo's target per joint velocity: damping needs a torque, and the target stands still for
-        # a whole step while the joint moves on.
+        # Offset of the servo's target per joint velocity: damping needs a torque, and the target stays in place for a
+        # whole step while the joint moves.
         self._offset = model.dof_damping[:7] / self._stiffness + step_seconds / 2
 
     def see(self, positions: ArrayLike) -> None:
-        """Put the scene into a state.
+        """Set the state of the scene.
 
         Args:
-            positions: (30,) of robot and objects.
+            positions: (30,) positions of robot and objects.
         """
         self.data.qpos[:] = positions
         mujoco.mj_kinematics(self.model, self.data)
@@ -98,7 +98,7 @@ class FrankaArm:
         return np.array(self.data.site(name).xpos)
 
     def moved(self, joint: str, point: Vector, by: float) -> Vector:
-        """Where a point of an object goes when the object's hinge or slide moves on.
+        """Where a point of an object moves to when the object's hinge or slide moves.
 
         Args:
             joint: Name of the hinge or slide.
@@ -111,8 +111,8 @@ class FrankaArm:
             return point + by * axis
         return anchor + _rotated(point - anchor, axis, by)
 
-    def lacks(self, aim: Aim) -> tuple[Vector, Vector]:
-        """How far the hand is from its aim: (3,) metres, and a rotation vector (3,) in rad, both in the world."""
+    def error(self, aim: Aim) -> tuple[Vector, Vector]:
+        """The distance of the hand from its aim: (3,) metres, and a rotation vector (3,) in rad, both in the world."""
         point, axes = self.hand()
         return aim.point - point, _rotation_vector(pointing(*aim.turn) @ axes.T)
 
@@ -121,13 +121,13 @@ class FrankaArm:
 
         Args:
             aim: Of the hand.
-            posture: (7,) joint angles that the arm drifts to as far as the hand does not notice.
+            posture: (7,) joint angles that the arm drifts to as far as that does not move the hand.
 
         Returns:
             (7,) rad/s; joints at their limits do not move further.
         """
         point, _ = self.hand()
-        distance, angle = self.lacks(aim)
+        distance, angle = self.error(aim)
         mujoco.mj_jac(self.model, self.data, self._linear, self._angular, point, self._body)
         jacobian = np.concatenate([self._linear[:, :7], ROTATION_WEIGHT * self._angular[:, :7]])
         linear = _at_most(aim.gain * distance, aim.speed)
@@ -148,9 +148,9 @@ class FrankaArm:
     def action(self, velocity: Vector, opening: float) -> Vector:
         """The action that gives the joints a velocity for one step.
 
-        The environment moves the targets of position servos and starts each step from where the joints are, so
-        that an action of zero lets the arm sink. The action makes up for that; where it would leave the box, the
-        arm is slower.
+        The environment moves the targets of position servos and starts each step from where the joints are, so that an
+        action of zero lets the arm sink. The action compensates for that; where it would leave the box, the arm moves
+        more slowly.
 
         Args:
             velocity: (7,) rad/s.

@@ -1,4 +1,11 @@
-"""Kitchen data: a scripted arm does four subtasks an episode, in varying orders, with noise."""
+"""Kitchen data: a scripted arm does four subtasks an episode, in varying orders, with noise.
+
+Every episode starts from the environment's own state and does four of the seven subtasks: in `kitchen-complete` always
+the task's, in order; in `kitchen-partial` any, among them sometimes the task's; in `kitchen-mixed` any but the task's
+four together. It ends (truncation) when they are done or given up, at the environment's time limit, or (termination)
+when the environment says that all of the task's are done. Rewards are the environment's, 1 when a subtask of the task
+is done for the first time. A set has at least the steps asked for: the last episode is complete.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +13,14 @@ import hashlib
 import itertools
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.collect.collecting import place, record_set
+from datamodules.collect.collecting import Collector, DataSetPlan
 from datamodules.collect.kitchen_moves import SCRIPTS, KitchenController
 from datamodules.collect.recording import Episode
 from dds_lightning.envs.build import build_env
@@ -32,8 +38,8 @@ ORDER = (
     ("light switch", "slide cabinet"),
     ("hinge cabinet",),
 )
-"""Earlier groups are done first, members of one group in any order. The open hinge cabinet would be in the way of
-the slide cabinet's handle, so it comes last."""
+"""Earlier groups are done first, members of one group in any order. The open hinge cabinet would block the slide
+cabinet's handle, so it comes last."""
 
 AIMED_AT = frozenset({"kettle", "bottom burner", "light switch", "slide cabinet"})
 """With the microwave, the subtasks of `kitchen-partial` and `kitchen-mixed`."""
@@ -63,85 +69,38 @@ class KitchenRecipe:
     tries: int = 3
 
     def __post_init__(self) -> None:
-        """Refuse what makes no sense."""
+        """Refuse settings out of range."""
         if not 0.0 <= self.action_noise < math.inf:
-            raise UserError(f"action_noise: found {self.action_noise}, expected a number of at least 0")
+            raise UserError(f"action_noise: got {self.action_noise}, expected a number of at least 0")
         if not 0.0 <= self.waypoint_noise <= 0.1:
-            raise UserError(f"waypoint_noise: found {self.waypoint_noise}, expected 0 to 0.1 metres")
+            raise UserError(f"waypoint_noise: got {self.waypoint_noise}, expected 0 to 0.1 metres")
         for name in ("speed_noise", "aimed_share"):
             if not 0.0 <= getattr(self, name) <= 1.0:
-                raise UserError(f"{name}: found {getattr(self, name)}, expected 0 to 1")
+                raise UserError(f"{name}: got {getattr(self, name)}, expected 0 to 1")
         if self.tries < 1:
-            raise UserError(f"tries: found {self.tries}, expected at least 1")
+            raise UserError(f"tries: got {self.tries}, expected at least 1")
 
 
 QUIET = KitchenRecipe(action_noise=0.0, waypoint_noise=0.0, speed_noise=0.0)
 """The behaviour at its best."""
 
 
-def collect_kitchen(
-    task: Task | str,
-    steps: int = 137_000,
-    seed: int = 0,
-    out: str | Path = "data",
-    workers: int | None = None,
-    *,
-    recipe: KitchenRecipe | None = None,
-    dataset_id: str | None = None,
-    overwrite: bool = False,
-    progress: bool = True,
-) -> Path:
-    """Collect a kitchen data set in `FrankaKitchen-v1` and write it as a Minari data set.
-
-    Every episode starts from the environment's own state and does four of the seven subtasks: in
-    `kitchen-complete` always the task's, in order; in `kitchen-partial` any, among them sometimes the task's;
-    in `kitchen-mixed` any but the task's four together. It ends (truncation) when they are done or given up, at
-    the environment's time limit, or (termination) when the environment says that all of the task's are done.
-    Rewards are the environment's, 1 when a subtask of the task is done for the first time. An interrupted call
-    goes on where it stopped when it is made again.
-
-    Args:
-        task: A kitchen task or its name.
-        steps: Environment steps, at least: the last episode is whole.
-        seed: Same seed, same bytes of every array, whatever the workers and interruptions.
-        out: Folder of data sets; the set becomes `out/<dataset_id>`, where MINARI_DATASETS_PATH=out finds it.
-        workers: Processes; None takes every core, 1 stays in this process.
-        recipe: What the behaviour does.
-        dataset_id: Name of the set; None takes the task's own, for example "kitchen-partial-v0".
-        overwrite: Replace a set of the same name.
-        progress: Show a progress bar on standard error.
-
-    Returns:
-        The data set's folder; `load_trajectories(f"local:{folder}", task)` reads it.
-
-    Raises:
-        UserError: For a task that is not the kitchen's, a number out of range, or a folder that exists.
-    """
-    task = get_task(task) if isinstance(task, str) else task
-    recipe = recipe or KitchenRecipe()
-    if task.family != "kitchen":
-        raise UserError(f"task: '{task.name}' is no kitchen task, and this collector makes data only for those")
-    folder = place(task, steps, seed, out, dataset_id, overwrite)
+def _plan(task: Task, seed: int, steps: int, recipe: KitchenRecipe) -> DataSetPlan:
     recorder = _Recorder(task, seed, steps, recipe)
     env, _ = recorder.kitchen()
-    moves = hashlib.sha256(repr(SCRIPTS).encode()).hexdigest()[:16]
-    return record_set(
-        folder,
+    return DataSetPlan(
         recorder,
         env,
-        {"task": task.name, "seed": seed, "steps": steps, **asdict(recipe), "moves": moves},
-        observation_space=env.observation_space,
+        env.observation_space,
         algorithm="scripted moves of the hand, damped least-squares inverse kinematics",
         description=_description(task, seed, recipe),
-        workers=workers,
-        overwrite=overwrite,
-        progress=progress,
-        shorten=lambda episodes: _until(episodes, steps),
+        settings={"moves": hashlib.sha256(repr(SCRIPTS).encode()).hexdigest()[:16]},
+        trim=lambda episodes: _until(episodes, steps),
     )
 
 
 def _until(episodes: Iterable[Episode], steps: int) -> Iterator[Episode]:
-    """Whole episodes until they have so many steps; what is recorded beyond that is given up."""
+    """Complete episodes until they have `steps` steps in all; what was recorded beyond that is dropped."""
     for episode in episodes:
         yield episode
         steps -= len(episode["rewards"])
@@ -174,7 +133,7 @@ def draw_subtasks(task: Task, rng: np.random.Generator, aimed_share: float) -> t
 
 
 class _Recorder:
-    """Records round i of a data set, one episode; everything about it follows from (seed, i)."""
+    """Records round i of a data set, one episode, which depends on (seed, i) alone."""
 
     def __init__(self, task: Task, seed: int, steps: int, recipe: KitchenRecipe) -> None:
         self.task, self.seed, self.steps, self.recipe = task, seed, steps, recipe
@@ -232,7 +191,7 @@ def _row(seen: Any, info: dict[str, Any], controller: KitchenController) -> tupl
 
 
 def _stacked(rows: list[Any]) -> Any:
-    """Arrays of observations, in the nested dictionaries that single observations are."""
+    """Arrays of observations, in the same nested dictionaries as single observations."""
     if isinstance(rows[0], dict):
         return {key: _stacked([row[key] for row in rows]) for key in rows[0]}
     return np.array(rows)
@@ -262,10 +221,7 @@ def _description(task: Task, seed: int, recipe: KitchenRecipe) -> str:
 
 
 class KitchenDemonstrator:
-    """The behaviour as an actor: does the task's subtasks in every kitchen of a batch.
-
-    `codes` is None: this actor chooses no skills.
-    """
+    """The behaviour as an actor: does the task's subtasks in every kitchen of a batch."""
 
     def __init__(self, task: Task | str, recipe: KitchenRecipe | None = None) -> None:
         """Prepare for `task`.
@@ -275,41 +231,53 @@ class KitchenDemonstrator:
             recipe: None is the behaviour at its best, doing the task's subtasks in order; `KitchenRecipe()` is
                 the data's behaviour, with its noise and its choice of subtasks.
         """
-        self.task = get_task(task) if isinstance(task, str) else task
-        self.recipe = recipe
-        self.codes: NDArray[np.int64] | None = None
+        self.task, self.recipe = get_task(task), recipe
         self._env = build_env(self.task.env_id)
         self.reset()
 
     def reset(self, num_envs: int = 1, seed: int | None = None) -> None:
-        """Forget everything and prepare for `num_envs` environments; `seed` fixes the noise."""
+        """Prepare for new episodes in `num_envs` environments; `seed` fixes the noise."""
         self._rng = np.random.default_rng(seed)
+        # How much a controller draws depends on its progress: a stream for each keeps the others' draws in place.
+        self._rngs = self._rng.spawn(num_envs)
         tries = (self.recipe or QUIET).tries
         self._controllers = [_controller(self._env, self.task, tries) for _ in range(num_envs)]
-        for controller in self._controllers:
-            self._restart(controller)
+        for row in range(num_envs):
+            self._restart(row)
 
-    def _restart(self, controller: KitchenController) -> None:
+    def _restart(self, row: int) -> None:
         if self.recipe is None:
-            controller.start(tuple(self.task.subtasks))
+            self._controllers[row].start(tuple(self.task.subtasks))
         else:
-            _start(controller, self.task, self._rng, self.recipe)
+            _start(self._controllers[row], self.task, self._rngs[row], self.recipe)
 
-    def act(self, observations: NDArray[np.float32], restarted: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
-        """Actions for a batch.
+    def act(
+        self,
+        observations: NDArray[np.float32],
+        restarted: NDArray[np.bool_] | None = None,
+        rows: NDArray[np.intp] | None = None,
+    ) -> NDArray[np.float32]:
+        """As `Actor.act`.
 
         Args:
-            observations: (E, 60).
-            restarted: (E,) True where an episode has just begun.
+            observations: (n, 60).
+            restarted: (n,) True where an episode has just begun; None means nowhere.
+            rows: (n,) their environments; None means all of them.
 
         Returns:
-            (E, 9) in the box.
+            (n, 9) in the box.
         """
-        noise = (self.recipe or QUIET).action_noise
-        actions = np.empty((len(self._controllers), self.task.action_dim))
-        for e, (controller, row) in enumerate(zip(self._controllers, observations, strict=True)):
-            if restarted is not None and restarted[e]:
-                self._restart(controller)
-            action = controller.act(row[:30])
-            actions[e] = controller.rest() if action is None else action
-        return np.clip(actions + noise * self._rng.standard_normal(actions.shape), -1.0, 1.0).astype(np.float32)
+        every = len(self._controllers)
+        rows = np.arange(every) if rows is None else rows
+        actions = np.empty((len(rows), self.task.action_dim))
+        for i, (row, observation) in enumerate(zip(rows.tolist(), observations, strict=True)):
+            if restarted is not None and restarted[i]:
+                self._restart(row)
+            action = self._controllers[row].act(observation[:30])
+            actions[i] = self._controllers[row].rest() if action is None else action
+        noise = (self.recipe or QUIET).action_noise * self._rng.standard_normal((every, actions.shape[1]))[rows]
+        return np.clip(actions + noise, -1.0, 1.0).astype(np.float32)
+
+
+COLLECTOR = Collector("kitchen", None, 137_000, KitchenRecipe, _plan, KitchenDemonstrator)
+collect_kitchen = COLLECTOR.collect

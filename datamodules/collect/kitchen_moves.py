@@ -1,4 +1,4 @@
-"""How each of the kitchen's subtasks is done: a few moves of the hand, and the controller that makes them in turn.
+"""How each of the kitchen's subtasks is done: a few moves of the hand, and the controller that performs them in turn.
 
 ```
     Reach ► Reach ► Grasp ► Drive ► Grasp ► Reach        microwave, knobs, hinge cabinet: grasp it, take it along
@@ -6,8 +6,8 @@
     Reach ► Reach ► Drive ► Reach                        light switch, slide cabinet: push from the side
 ```
 
-The numbers were found by hand in the simulator: a grasp or a side to push from that the arm reaches without touching
-anything else, then speeds and leads at which the object comes along.
+The numbers were tuned by hand in the simulator: a grasp, or a side to push from, that the arm reaches without touching
+anything else, then speeds and leads at which the object moves along.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from dds_lightning.envs.kitchen import subtasks_done
 
 Triple = tuple[float, float, float]
 HALF_OPEN = 0.018
-"""Two fingers side by side that still fit between the posts of the kettle's handle."""
+"""Finger opening (m) that still fits between the posts of the kettle's handle."""
 
 PATIENCE = 12
-"""Steps in which an object must come 2 % closer to where it should be, or else the hand has slipped off."""
+"""Steps in which an object must come 2 % closer to its target, or else the hand has slipped off."""
 
 TURNED = 0.2
-"""A place is reached only when the hand's direction is right to so many rad."""
+"""A place is reached only when the hand's direction is within this many rad of the wanted one."""
 
 LOST = 0.06
 """The kettle has slipped off when the hand has moved this far (m) away from it."""
@@ -38,7 +38,7 @@ LOST = 0.06
 
 @dataclass(frozen=True)
 class Reach:
-    """Bring the hand to a place beside the handle, wherever that is now.
+    """Bring the hand to a position relative to the handle, wherever that is now.
 
     Attributes:
         offset: From the handle, metres in the world.
@@ -46,7 +46,7 @@ class Reach:
         opening: Of each finger, metres.
         speed: At most, m/s.
         near: Done within this many metres.
-        steps: Given up after as many.
+        steps: Given up after this many.
         stray: Factor on the noise of waypoints.
     """
 
@@ -69,7 +69,7 @@ class Grasp:
 
 @dataclass(frozen=True)
 class Drive:
-    """Take a hinge or slide along.
+    """Move a hinge or slide.
 
     Attributes:
         to: Value of the joint.
@@ -81,7 +81,7 @@ class Drive:
         opening: Of each finger, metres.
         speed: At most, m/s.
         gain: Speed per distance, 1/s.
-        steps: Given up after as many.
+        steps: Given up after this many.
     """
 
     to: float
@@ -98,7 +98,7 @@ class Drive:
 
 @dataclass(frozen=True)
 class Carry:
-    """Move the hand by what the kettle lacks to a place (metres in the world)."""
+    """Move the hand by the distance of the kettle from its target `to` (metres in the world)."""
 
     to: Triple
     turn: Triple
@@ -117,7 +117,7 @@ class Script(NamedTuple):
     Attributes:
         handle: Name of the site.
         joint: Name of the joint that moves.
-        moves: In turn.
+        moves: The moves, in order.
         posture: (7,) joint angles that the arm drifts to.
     """
 
@@ -216,9 +216,9 @@ SCRIPTS: dict[str, Script] = {
 
 
 class KitchenController:
-    """Does subtasks one after the other; sees positions of robot and objects, as an agent does.
+    """Does subtasks one after the other; it observes the positions of robot and objects, as an agent does.
 
-    A subtask that has failed is tried again from its start, up to `tries` times. `missed` holds those given up.
+    A subtask that has failed is tried again from its start, up to `tries` times. `missed` lists those given up.
     """
 
     def __init__(self, model: mujoco.MjModel, step_seconds: float, *, tries: int = 3) -> None:
@@ -238,7 +238,7 @@ class KitchenController:
 
         Args:
             subtasks: In the order in which they are done.
-            rng: Of the noise; may be missing where there is none.
+            rng: Generator of the noise; not needed without noise.
             waypoint_noise: Standard deviation (m, each axis) of where the hand goes, times each move's `stray`.
             speed_noise: Each subtask is done up to this share slower or faster.
         """
@@ -275,7 +275,7 @@ class KitchenController:
 
     @property
     def subtask(self) -> str | None:
-        """What it is doing; None after the last."""
+        """The current subtask; None after the last."""
         return self._subtasks[self._number] if self._number < len(self._subtasks) else None
 
     def rest(self) -> NDArray[np.float64]:
@@ -307,18 +307,18 @@ class KitchenController:
         self._gap: Vector | None = None
         self._best, self._best_count = 0.0, 0
         move = self._script.moves[index] if index < len(self._script.moves) else None
-        if isinstance(move, Reach):  # what follows keeps the error with which the handle was met
+        if isinstance(move, Reach):  # what follows keeps the error with which the handle was reached
             self._error = self._waypoint_noise * move.stray * self._rng.standard_normal(3)
 
     def _aim(self, move: Move) -> tuple[Aim, bool]:
-        """Where the hand goes now, and whether it has been there."""
+        """Where the hand should move now, and whether it has arrived there."""
         arm = self.arm
         point, _ = arm.hand()
         if isinstance(move, Grasp):
             return replace(self._held, speed=0.3), False
         if isinstance(move, Reach):
             aim = Aim(arm.site(self._script.handle) + move.offset + self._error, move.turn, move.speed)
-            distance, angle = arm.lacks(aim)
+            distance, angle = arm.error(aim)
             return aim, bool(np.linalg.norm(distance) < move.near and np.linalg.norm(angle) < TURNED)
         if isinstance(move, Carry):
             return self._carrying(move, point)
@@ -331,13 +331,13 @@ class KitchenController:
         lack = np.asarray(move.to) - self.arm.data.joint(self._script.joint).qpos[:3]
         lost = bool(np.linalg.norm(gap - self._gap) > LOST)
         if lost:
-            self._index = len(self._script.moves) - 2  # the hand draws back next
+            self._index = len(self._script.moves) - 2  # the hand retreats next
         return Aim(point + lack, move.turn, move.speed), lost or bool(np.linalg.norm(lack) < move.near)
 
     def _driving(self, move: Drive) -> tuple[Aim, bool]:
         arm, joint = self.arm, self._script.joint
         value = float(arm.data.joint(joint).qpos[0])
-        # A tenth further than where it should end: the hand must still pull when it is nearly there.
+        # A tenth further than the target: the hand must still pull when it has nearly arrived.
         ahead = float(np.clip(1.1 * move.to - value, -move.lead, move.lead))
         handle = arm.site(self._script.handle)
         at_zero = arm.moved(joint, handle, -value)

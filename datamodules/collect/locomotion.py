@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,16 +23,16 @@ from numpy.typing import NDArray
 
 from datamodules.behaviours.policy import MLPPolicy
 from datamodules.behaviours.shipped import load_ladder
-from datamodules.collect.collecting import place, record_set
+from datamodules.collect.collecting import Collector, DataSetPlan
 from datamodules.collect.recording import Episode
 from dds_lightning.envs.build import build_env
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import Task, get_task
 
 BODIES = 8
-"""Runners side by side in one process; belongs to the data, like the seed."""
+"""Runners side by side in one process; the data depend on it, as on the seed."""
 MEDIUM = 0.42
-"""Score of a medium behaviour as a share of the expert's."""
+"""Score of the medium behaviour as a share of the expert's."""
 
 
 @dataclass(frozen=True)
@@ -48,69 +49,27 @@ class LocomotionRecipe:
     episode_steps: int = 1000
 
     def __post_init__(self) -> None:
-        """Refuse what makes no sense."""
+        """Refuse settings out of range."""
         if not 0.0 <= self.action_noise < math.inf:
-            raise UserError(f"action_noise: found {self.action_noise}, expected a number of at least 0")
+            raise UserError(f"action_noise: got {self.action_noise}, expected a number of at least 0")
         if self.episode_steps < 1:
-            raise UserError(f"episode_steps: found {self.episode_steps}, expected at least 1")
+            raise UserError(f"episode_steps: got {self.episode_steps}, expected at least 1")
 
 
-def collect_locomotion(
-    task: Task | str,
-    steps: int = 1_000_000,
-    seed: int = 0,
-    out: str | Path = "data",
-    workers: int | None = None,
-    *,
-    recipe: LocomotionRecipe | None = None,
-    ladder: Mapping[str, MLPPolicy] | None = None,
-    dataset_id: str | None = None,
-    overwrite: bool = False,
-    progress: bool = True,
-) -> Path:
-    """Collect a locomotion data set and write it as a Minari data set.
-
-    An interrupted call goes on where it stopped when it is made again.
-
-    Args:
-        task: A locomotion task or its name.
-        steps: Environment steps in all.
-        seed: Same seed, same bytes of every array, whatever the workers and interruptions.
-        out: Folder of data sets; the set becomes `out/<dataset_id>`.
-        workers: Processes; None takes every core, 1 stays in this process.
-        recipe: What the behaviour does.
-        ladder: Policies by name, rising scores, the last the expert; None takes the shipped ones.
-        dataset_id: Name of the set; None takes the task's own, for example "hopper-medium-expert-v0".
-        overwrite: Replace a set of the same name.
-        progress: Show a progress bar on standard error.
-
-    Returns:
-        The data set's folder; `load_trajectories(f"local:{folder}", task)` reads it.
-
-    Raises:
-        UserError: For a task of another family, a number out of range, no ladder, or a folder that exists.
-    """
-    task = get_task(task) if isinstance(task, str) else task
-    recipe = recipe or LocomotionRecipe()
-    if task.family != "locomotion":
-        raise UserError(f"task: '{task.name}' is no locomotion task, and this collector knows only those")
-    folder = place(task, steps, seed, out, dataset_id, overwrite)
+def _plan(
+    task: Task, seed: int, steps: int, recipe: LocomotionRecipe, ladder: Mapping[str, MLPPolicy] | None = None
+) -> DataSetPlan:
     body, _, quality = task.base_name.partition("-")
     chosen = mixture(ladder or load_ladder(body), quality)
     recorder = _Recorder(task, seed, steps, recipe, tuple(chosen.values()))
-    behaviours = {rung: dict(policy.metadata) for rung, policy in chosen.items()}
     noise = f"with action noise {recipe.action_noise}"
-    return record_set(
-        folder,
+    return DataSetPlan(
         recorder,
         recorder.env(),
-        {"task": task.name, "seed": seed, "steps": steps, **asdict(recipe), "behaviours": behaviours},
-        observation_space=gym.spaces.Box(-np.inf, np.inf, (task.observation_dim,), np.float32),
+        gym.spaces.Box(-np.inf, np.inf, (task.observation_dim,), np.float32),
         algorithm=f"PPO, {', '.join(chosen)}",
         description=f"{body} run by {len(chosen)} behaviour(s) {noise}. Seed {seed}.",
-        workers=workers,
-        overwrite=overwrite,
-        progress=progress,
+        settings={"behaviours": {rung: dict(policy.metadata) for rung, policy in chosen.items()}},
     )
 
 
@@ -133,18 +92,18 @@ def mixture(ladder: Mapping[str, MLPPolicy], quality: str) -> dict[str, MLPPolic
         "medium-expert": [names[middle], names[-1]],
     }
     if quality not in chosen:
-        raise UserError(f"quality: found '{quality}', expected one of {', '.join(chosen)}")
+        raise UserError(f"quality: got '{quality}', expected one of {', '.join(chosen)}")
     return {name: ladder[name] for name in chosen[quality]}
 
 
 class _Recorder:
-    """Records round i of a data set: some runners of one behaviour side by side; follows from (seed, i) alone."""
+    """Records round i of a data set: runners of one behaviour side by side; depends on (seed, i) alone."""
 
     def __init__(
         self, task: Task, seed: int, steps: int, recipe: LocomotionRecipe, policies: tuple[MLPPolicy, ...]
     ) -> None:
         self.task, self.seed, self.steps, self.recipe, self.policies = task, seed, steps, recipe, policies
-        # Each behaviour needs rounds enough for its share, however small the set is.
+        # Each behaviour needs enough rounds for its share, however small the set is.
         self.size = min(BODIES * recipe.episode_steps, -(-steps // len(policies)))
         self.rounds = -(-steps // self.size)
         self._envs: list[gym.Env[Any, Any]] = []
@@ -173,7 +132,7 @@ class _Recorder:
 
 
 class _Run:
-    """One runner for a number of steps, in as many episodes as they take."""
+    """One runner for a number of steps, in as many episodes as that takes."""
 
     def __init__(self, recipe: LocomotionRecipe, env: gym.Env[Any, Any], rng: np.random.Generator, steps: int) -> None:
         self.recipe, self.env, self.rng, self.left = recipe, env, rng, steps
@@ -187,7 +146,7 @@ class _Run:
         self.rewards: list[float] = []
 
     def step(self, action: NDArray[np.float32]) -> None:
-        """Act once, with noise; where the episode ends, begin the next."""
+        """Act once, with noise; begin the next episode where this one ends."""
         noise = self.recipe.action_noise * self.rng.standard_normal(len(action))
         self.actions.append(np.clip(action + noise, -1.0, 1.0).astype(np.float32))
         self.state, reward, terminated, truncated, _ = self.env.step(self.actions[-1])
@@ -211,32 +170,55 @@ class _Run:
 
 
 class Runners:
-    """The behaviours of a data set as an actor: environment e is played by behaviour e modulo their number.
-
-    `codes` is None: this actor chooses no skills.
-    """
+    """The behaviours of a data set as an actor: behaviour e modulo their number plays in environment e."""
 
     def __init__(
         self, task: Task | str, recipe: LocomotionRecipe | None = None, ladder: Mapping[str, MLPPolicy] | None = None
     ) -> None:
         """Prepare for `task`; the arguments are those of `collect_locomotion`."""
-        task = get_task(task) if isinstance(task, str) else task
         self.recipe = recipe or LocomotionRecipe()
-        body, _, quality = task.base_name.partition("-")
+        body, _, quality = get_task(task).base_name.partition("-")
         self.policies = tuple(mixture(ladder or load_ladder(body), quality).values())
-        self.codes: NDArray[np.int64] | None = None
         self.reset()
 
     def reset(self, num_envs: int = 1, seed: int | None = None) -> None:
-        """Prepare for `num_envs` environments; `seed` fixes the noise."""
-        del num_envs
-        self._rng = np.random.default_rng(seed)
+        """Prepare for new episodes in `num_envs` environments; `seed` fixes the noise."""
+        self.num_envs, self._rng = num_envs, np.random.default_rng(seed)
 
-    def act(self, observations: NDArray[np.float32], restarted: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
-        """Actions (E, A) in the box for observations (E, O)."""
-        del restarted
-        owners = np.arange(len(observations)) % len(self.policies)
-        proposed = np.stack([policy.act(observations) for policy in self.policies])  # (policies, E, A)
-        actions = proposed[owners, np.arange(len(observations))]
-        noise = self.recipe.action_noise * self._rng.standard_normal(actions.shape)
+    def act(
+        self,
+        observations: NDArray[np.float32],
+        restarted: NDArray[np.bool_] | None = None,
+        rows: NDArray[np.intp] | None = None,
+    ) -> NDArray[np.float32]:
+        """As `Actor.act`: actions (n, A) in the box for observations (n, O); without `rows`, of all environments."""
+        rows = np.arange(self.num_envs) if rows is None else rows
+        proposed = np.stack([policy.act(observations) for policy in self.policies])  # (policies, n, A)
+        actions = proposed[rows % len(self.policies), np.arange(len(rows))]
+        # Drawn for all environments, so that the noise of one does not depend on which others have finished.
+        noise = self.recipe.action_noise * self._rng.standard_normal((self.num_envs, actions.shape[1]))[rows]
         return np.clip(actions + noise, -1.0, 1.0).astype(np.float32)
+
+
+COLLECTOR = Collector("locomotion", None, 1_000_000, LocomotionRecipe, _plan, Runners)
+
+
+def collect_locomotion(
+    task: Task | str, *arguments: Any, ladder: Mapping[str, MLPPolicy] | None = None, **options: Any
+) -> Path:
+    """Collect a locomotion data set.
+
+    Args:
+        task: A locomotion task or its name.
+        *arguments: As in `Collector.collect`.
+        ladder: Policies by name, rising scores, the last the expert; None takes the shipped ones.
+        **options: As in `Collector.collect`.
+
+    Returns:
+        The data set's folder.
+
+    Raises:
+        UserError: As in `Collector.collect`, and without a ladder for the task's body.
+    """
+    collector = replace(COLLECTOR, plan=partial(_plan, ladder=ladder))
+    return collector.collect(task, *arguments, **options)

@@ -1,4 +1,4 @@
-"""Writes a Minari data set: whole or not at all, every chunk with a checksum."""
+"""Writes a Minari data set: completely or not at all, every chunk with a checksum."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from dds_lightning.saving.files import folder_written_whole
 Episode = Mapping[str, Any]
 """Minari's field names (observations, actions, rewards, ..., infos) to arrays or mappings of arrays."""
 ROOM_TO_CLOSE = 4 << 20
-"""Bytes of a disk that stay free: for HDF5's own tables and what others write meanwhile."""
+"""Bytes of the disk that stay free, for HDF5's tables and what other processes write meanwhile."""
 
 
 def write_minari(
@@ -39,15 +39,15 @@ def write_minari(
 ) -> Path:
     """Write `root/dataset_id/data/{main_data.hdf5,metadata.json}`, as `minari.load_dataset` expects them.
 
-    Everything is written into a hidden sibling folder which takes its name only when it is complete, so that
-    an interrupted run leaves no data set. Chunks carry HDF5's Fletcher-32 sums: changed bytes are noticed on
+    Everything is written into a hidden sibling folder that is renamed only when it is complete, so that an interrupted
+    run leaves no data set. Chunks carry HDF5's Fletcher-32 sums: changed bytes are noticed on
     reading.
 
     Args:
         root: Folder of data sets; the value of MINARI_DATASETS_PATH under which Minari finds this one.
         dataset_id: Minari's name, for example "pointmaze-large-diverse-v0".
         episodes: Consumed one by one; arrays have T rows (observations and infos T + 1).
-        env_spec: How to make the recorded environment again.
+        env_spec: Specification of the recorded environment.
         observation_space: Space of the stored observations.
         action_space: Space of the stored actions.
         metadata: More entries for metadata.json (author, algorithm_name, description, ...).
@@ -101,7 +101,7 @@ def _write_episodes(path: Path, episodes: Iterable[Episode]) -> tuple[int, int]:
 
 
 def _refuse_full_disk(path: Path, episode: Episode) -> None:
-    """Stop while there is room to close the file: where a write fails, HDF5 takes the whole process down."""
+    """Stop while there is room to close the file: when a write fails, HDF5 aborts the whole process."""
     if shutil.disk_usage(path.parent).free < _size(episode) + ROOM_TO_CLOSE:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 

@@ -1,4 +1,4 @@
-"""Shortest paths through the cells of a maze, for any maze that is drawn with 0 and 1."""
+"""Shortest paths through the cells of any maze that is drawn with 0 and 1."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ Cell = tuple[int, int]
 
 
 class MazePlanner:
-    """Breadth-first search from every free cell, once; afterwards every question is one look-up.
+    """Breadth-first search from every free cell, once; afterwards every query is one look-up.
 
     Cells are numbered row by row: `index = row * columns + column`.
 
     Attributes:
         next_cell: (cells, cells) int64; `next_cell[goal, cell]` is the neighbour of `cell` nearest to `goal`,
             the goal itself at the goal. A wall cell points at the nearest free cell, so that a body whose
-            centre slips over an edge finds back.
-        distance: (cells, cells) int64; steps between cells, -1 where there is no way.
+            centre slips over an edge finds its way back.
+        distance: (cells, cells) int64; steps between cells, -1 where there is no path.
     """
 
     def __init__(self, maze_map: tuple[str, ...]) -> None:
         """Plan on `maze_map`: rows of "0" (free) and "1" (wall), all of one length."""
         self.rows, self.columns = len(maze_map), len(maze_map[0])
         if any(len(row) != self.columns or set(row) - {"0", "1"} for row in maze_map):
-            raise UserError(f"maze_map: expected equally long rows of 0 and 1, found {maze_map}")
+            raise UserError(f"maze_map: expected equally long rows of 0 and 1, got {maze_map}")
         self.free = np.array([value == "0" for row in maze_map for value in row])
         cells = self.rows * self.columns
         self.next_cell = np.tile(np.arange(cells), (cells, 1))
@@ -67,14 +67,14 @@ class MazePlanner:
         return int(cell[0]) * self.columns + int(cell[1])
 
     def path(self, start: Cell, goal: Cell) -> list[Cell]:
-        """Cells of a shortest way, both ends included.
+        """Cells of a shortest path, both ends included.
 
         Raises:
-            UserError: When an end is a wall or there is no way.
+            UserError: When an end is a wall or there is no path.
         """
         cell, end = self.index(start), self.index(goal)
         if self.distance[end, cell] < 0:
-            raise UserError(f"maze: there is no way from cell {start} to cell {goal}")
+            raise UserError(f"maze: there is no path from cell {start} to cell {goal}")
         cells = [cell]
         while cell != end:
             cell = int(self.next_cell[end, cell])
@@ -88,5 +88,5 @@ class MazePlanner:
 
 @lru_cache(maxsize=32)
 def planner_for(maze_map: tuple[str, ...]) -> MazePlanner:
-    """The planner of a maze, made once a process."""
+    """The planner of a maze, created once per process."""
     return MazePlanner(maze_map)

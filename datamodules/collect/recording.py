@@ -1,9 +1,9 @@
-"""Recording episodes on all cores, in rounds that are functions of the seed and their number alone.
+"""Records episodes on all cores, in rounds that depend on the seed and their number alone.
 
 ```
- recorder(0) recorder(1) recorder(2) recorder(3) │ recorder(4) ...    a round is some episodes, a parcel some rounds
- └────────────────── parcel 0 ───────────────────┘
-        │  kept as a file until the data set is whole, so that an interrupted collection goes on
+ recorder(0) recorder(1) recorder(2) recorder(3) │ recorder(4) ...    a round is one or more episodes,
+ └────────────────── chunk 0 ───────────────────┘                     a chunk one or more rounds
+        │  kept as a file until the data set is complete, so that an interrupted collection can continue
         ▼
  episodes in order ─► the data set
 ```
@@ -33,12 +33,12 @@ Episode = dict[str, Any]
 
 
 class EpisodeRecorder(Protocol):
-    """Records round i of a data set; picklable, and everything about a round follows from its number."""
+    """Records round i of a data set; picklable, and a round depends on nothing but its number."""
 
     steps: int
-    """Steps of the whole set."""
+    """Steps of the complete set."""
     rounds: int
-    """Rounds of the whole set."""
+    """Rounds of the complete set."""
 
     def __call__(self, number: int) -> list[Episode]:
         """Record one round, one episode or more: Minari's field names to arrays or mappings of arrays."""
@@ -48,8 +48,8 @@ def record(
     recorder: EpisodeRecorder,
     workers: int | None = None,
     *,
-    parcel: int = 4,
-    kept: Kept | None = None,
+    chunk: int = 4,
+    partial: PartialRecording | None = None,
     title: str | None = None,
 ) -> Iterator[Episode]:
     """Every episode in order.
@@ -57,31 +57,31 @@ def record(
     Args:
         recorder: What records them.
         workers: Processes; None takes every core, 1 stays in this process.
-        parcel: Rounds that a worker fetches at once; has no influence on the data.
-        kept: Parcels of an earlier, interrupted call, and where to put the new ones.
+        chunk: Rounds that a worker records at once; does not affect the data.
+        partial: Chunks of an earlier, interrupted call; new ones are added to it.
         title: Of a progress bar on standard error; None shows none.
 
     Raises:
         UserError: For a number of workers below 1, or when a worker process died.
     """
     if workers is not None and workers < 1:
-        raise UserError(f"workers: found {workers}, expected at least 1, or none for every core")
-    if kept is not None:
-        kept.open()
-    parcels = range(0, recorder.rounds, parcel)
-    missing = [first for first in parcels if kept is None or not kept.has(first)]
+        raise UserError(f"workers: got {workers}, expected at least 1, or none for every core")
+    if partial is not None:
+        partial.open()
+    chunks = range(0, recorder.rounds, chunk)
+    missing = [first for first in chunks if partial is None or not partial.has(first)]
     workers = min(workers or _cores(), max(len(missing), 1))
-    parts = [range(first, min(first + parcel, recorder.rounds)) for first in missing]
-    made = _in_parallel(recorder, parts, workers) if workers > 1 else (_parcel(recorder, part) for part in parts)
-    episodes = _in_order(parcels, set(missing), made, kept)
+    parts = [range(first, min(first + chunk, recorder.rounds)) for first in missing]
+    made = _in_parallel(recorder, parts, workers) if workers > 1 else (_chunk(recorder, part) for part in parts)
+    episodes = _in_order(chunks, set(missing), made, partial)
     return _with_progress(episodes, recorder.steps, title) if title else episodes
 
 
-class Kept:
-    """Parcels on disk, beside the data set that they will become; other settings start anew.
+class PartialRecording:
+    """Chunks on disk beside the data set that they will become; those of other settings are discarded.
 
     Args:
-        folder: Of the data set; the parcels lie in a hidden folder beside it.
+        folder: Of the data set; the chunks are stored in a hidden folder beside it.
         settings: Everything that the data depend on.
     """
 
@@ -91,7 +91,7 @@ class Kept:
         self.key = hashlib.sha256(text.encode()).hexdigest()
 
     def open(self) -> None:
-        """Make the folder ready: parcels of other settings go."""
+        """Create the folder; chunks of other settings are deleted."""
         note = self.folder / "settings"
         if not note.is_file() or note.read_text(encoding="utf-8") != self.key:
             shutil.rmtree(self.folder, ignore_errors=True)
@@ -99,29 +99,29 @@ class Kept:
             note.write_text(self.key, encoding="utf-8")
 
     def has(self, first: int) -> bool:
-        """Whether the parcel that begins with a round is there."""
+        """Whether the chunk that begins with round `first` is stored."""
         return self._path(first).is_file()
 
     def write(self, first: int, episodes: list[Episode]) -> None:
-        """Keep a parcel, whole or not at all."""
+        """Store a chunk atomically."""
         arrays = {f"{i}/{name}": array for i, episode in enumerate(episodes) for name, array in _flat(episode)}
         with written_whole(self._path(first)) as part, part.open("wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
+            np.savez(file, **arrays)
 
     def read(self, first: int) -> list[Episode]:
-        """The episodes of a parcel."""
+        """The episodes of the chunk that begins with round `first`."""
         episodes: dict[int, Episode] = {}
         with np.load(self._path(first), allow_pickle=False) as stored:
             for key in stored.files:
                 number, *path, name = key.split("/")
-                place = episodes.setdefault(int(number), {})
+                fields = episodes.setdefault(int(number), {})
                 for step in path:
-                    place = place.setdefault(step, {})
-                place[name] = stored[key]
+                    fields = fields.setdefault(step, {})
+                fields[name] = stored[key]
         return [episodes[number] for number in sorted(episodes)]
 
     def remove(self) -> None:
-        """Forget the parcels: the data set is whole."""
+        """Delete the chunks once the data set is complete."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _path(self, first: int) -> Path:
@@ -137,16 +137,16 @@ def _flat(fields: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
 
 
 def _in_order(
-    parcels: Iterable[int], missing: set[int], made: Iterator[list[Episode]], kept: Kept | None
+    chunks: Iterable[int], missing: set[int], made: Iterator[list[Episode]], partial: PartialRecording | None
 ) -> Iterator[Episode]:
-    for first in parcels:
+    for first in chunks:
         if first not in missing:
-            assert kept is not None
-            yield from kept.read(first)
+            assert partial is not None
+            yield from partial.read(first)
             continue
         episodes = next(made)
-        if kept is not None:
-            kept.write(first, episodes)
+        if partial is not None:
+            partial.write(first, episodes)
         yield from episodes
 
 
@@ -154,12 +154,12 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _in_parallel(recorder: EpisodeRecorder, parcels: list[range], workers: int) -> Iterator[list[Episode]]:
-    # No fork: a parent that runs deep-learning threads must not be copied.
+def _in_parallel(recorder: EpisodeRecorder, chunks: list[range], workers: int) -> Iterator[list[Episode]]:
+    # No fork: a parent with deep-learning threads must not be copied.
     method = "spawn" if sys.platform in ("win32", "darwin") else "forkserver"
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context(method), _keep, (recorder,))
+    pool = ProcessPoolExecutor(workers, multiprocessing.get_context(method), _set_recorder, (recorder,))
     try:
-        yield from pool.map(_record, parcels)
+        yield from pool.map(_record, chunks)
     except (BrokenProcessPool, ConnectionError, EOFError) as error:
         raise UserError(
             "workers: a collecting process died; a script must call this under `if __name__ == '__main__':`, "
@@ -172,28 +172,23 @@ def _in_parallel(recorder: EpisodeRecorder, parcels: list[range], workers: int) 
 _recorder: EpisodeRecorder | None = None
 
 
-def _keep(recorder: EpisodeRecorder) -> None:
+def _set_recorder(recorder: EpisodeRecorder) -> None:
     global _recorder
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     _recorder = recorder
 
 
 def _record(rounds: range) -> list[Episode]:
     assert _recorder is not None
-    return _parcel(_recorder, rounds)
+    return _chunk(_recorder, rounds)
 
 
-def _parcel(recorder: EpisodeRecorder, rounds: range) -> list[Episode]:
+def _chunk(recorder: EpisodeRecorder, rounds: range) -> list[Episode]:
     return [episode for number in rounds for episode in recorder(number)]
 
 
 def _with_progress(episodes: Iterator[Episode], steps: int, title: str) -> Iterator[Episode]:
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from dds_lightning.console.progress import track
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("steps"))
-    with Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True)) as bar:
-        work = bar.add_task(title, total=steps)
-        for episode in episodes:
-            yield episode
-            bar.advance(work, len(episode["rewards"]))
+    layout = ("{task.description}", "bar", "count", "steps", "elapsed")
+    return track(episodes, layout, steps, title, lambda episode: len(episode["rewards"]), transient=False)

@@ -1,4 +1,4 @@
-"""Where to head next on the way through a maze."""
+"""The next waypoint on the way through a maze."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ XY = tuple[float, float]
 class Waypoints:
     """Follows shortest paths over a maze's cells, one body and one goal at a time.
 
-    Plain Python floats: this runs once a step of the simulator, where NumPy on two numbers would cost more.
+    It uses plain Python floats: it runs once per step of the simulator, where NumPy on two numbers would be slower.
     """
 
     def __init__(self, task: Task) -> None:
@@ -34,7 +34,7 @@ class Waypoints:
         self._target = (0.0, 0.0)
 
     def index(self, x: float, y: float) -> int:
-        """Number of the cell that holds a position, row by row; positions outside count to the nearest edge."""
+        """Number of the cell of a position, row by row; a position outside belongs to the nearest edge."""
         row = math.floor(self._down * y / self.size + self._row0 + 0.5)
         column = math.floor(x / self.size + self._column0 + 0.5)
         return min(max(row, 0), self.rows - 1) * self.columns + min(max(column, 0), self.columns - 1)
@@ -46,8 +46,7 @@ class Waypoints:
             x: Metres.
             y: Metres.
             goal: Final position.
-            offset: Metres from the next cell's centre; taken in when the body enters a cell or gets a new
-                goal.
+            offset: Metres from the next cell's centre; used when the body enters a cell or gets a new goal.
 
         Returns:
             The goal in the goal's cell, else a point in the next cell of a shortest path.

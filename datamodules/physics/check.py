@@ -24,11 +24,13 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from datamodules.physics.resimulate import blur, inside, simulate
+from datamodules.physics.resimulate import blur, simulate
 from datamodules.physics.states import RecordedSteps, draw_steps
 from datamodules.sources import resolve_task
 from datamodules.validation import DataError
 from dds_lightning.tasks import Task
+from dds_lightning.tasks.bodies import body_of
+from dds_lightning.tasks.env import open_env
 
 LIMIT = 0.01
 """Relative error up to which a noiseless recording fits. Rounding to 32 bits makes 3e-5 at most; a tenth more gravity
@@ -262,13 +264,15 @@ def replay_check(spec: str, task: Task | str, steps: int = 200, seed: int = 0) -
 
 
 def _replay(task: Task, recorded: RecordedSteps) -> PhysicsReplay:
-    with inside(task) as inner:
+    with open_env(task) as env:
+        inner: Any = env.unwrapped
         return _compare(task, inner, recorded)
 
 
 def _replay_margins(task: Task, recorded: RecordedSteps) -> Iterator[PhysicsReplay]:
     """The physics with other contact margins that the recorded states fit."""
-    with inside(task) as inner:
+    with open_env(task) as env:
+        inner: Any = env.unwrapped
         margins = inner.model.geom_margin
         own = margins.copy()
         touching = own[(inner.model.geom_contype | inner.model.geom_conaffinity) != 0]
@@ -288,7 +292,7 @@ def _compare(task: Task, inner: Any, recorded: RecordedSteps, margins: float = 1
         margins,
         _dimensions(recorded, simulated, blur(inner, recorded, simulated)),
         NOISY_LIMIT if recorded.layout.noisy else LIMIT,
-        _compare_rewards(recorded, rewards) if task.family == "locomotion" else None,
+        _compare_rewards(recorded, rewards) if body_of(task).falls else None,
     )
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
 from typing import Any
 
 import mujoco
@@ -11,23 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.physics.states import RecordedSteps
-from dds_lightning.tasks import Task
 
 KITCHEN_NOISE = ((0.01, 0.0005), (0.1, 0.1))
 """Noise on (robot, objects) as shares of the kitchen's amplitudes: FrankaKitchen-v1's, and D4RL's."""
 
 Floats = NDArray[np.float64]
-
-
-@contextlib.contextmanager
-def inside(task: Task) -> Iterator[Any]:
-    """The task's environment without its wrappers, after a reset."""
-    env = task.make_env()
-    try:
-        env.reset(seed=0)
-        yield env.unwrapped
-    finally:
-        env.close()
 
 
 def simulate(inner: Any, recorded: RecordedSteps, noise: _Noise | None = None) -> tuple[Floats, Floats]:

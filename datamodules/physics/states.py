@@ -13,17 +13,16 @@ Where a D4RL file has `infos/qpos` and `infos/qvel` of the same rows, the state 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.sources import open_rows
-from datamodules.sources.rows import Recording
+from datamodules.sources.rows import Recording, open_recording
 from datamodules.validation import DataError
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import Task
-from dds_lightning.tasks.columns import observation_names
+from dds_lightning.tasks.bodies import StateLayout, body_of, state_layout
 
 FALLS = 4
 """In locomotion at most every so-manieth step ends its episode: there versions of an environment differ."""
@@ -35,40 +34,6 @@ SAME = 1e-3
 """`infos` and observations of one state differ by no more than this, absolutely or relatively."""
 
 Floats = NDArray[np.float64]
-
-
-class StateLayout(NamedTuple):
-    """Which columns of W recorded numbers are the simulator's state.
-
-    Attributes:
-        names: W names with units.
-        positions: Columns with qpos, in its order.
-        velocities: Columns with qvel; none where they are not recorded.
-        degrees: Entries of qvel.
-        hidden: Entries of qpos before the recorded ones.
-        speed_limit: Recorded velocities are cut to +-this.
-        lead: Steps that a replay begins earlier, so that velocities which had to be estimated are forgotten.
-        noisy: Whether states were recorded with noise.
-        judged: The first so many columns tell whether a recording fits; None takes all. In the kitchen they are the
-            robot's: pushing an object turns the noise on the robot's position into any error.
-    """
-
-    names: tuple[str, ...]
-    positions: tuple[int, ...]
-    velocities: tuple[int, ...]
-    degrees: int
-    hidden: int = 0
-    speed_limit: float = np.inf
-    lead: int = 0
-    noisy: bool = False
-    judged: int | None = None
-
-    def observe(self, qpos: Floats, qvel: Floats) -> Floats:
-        """The W numbers that a recording holds of a state, without noise."""
-        seen = np.zeros(len(self.names))
-        seen[list(self.positions)] = qpos[self.hidden :]
-        seen[list(self.velocities)] = np.clip(qvel, -self.speed_limit, self.speed_limit)[: len(self.velocities)]
-        return seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,28 +63,6 @@ class RecordedSteps:
     notes: tuple[str, ...] = ()
 
 
-def state_layout(task: Task, width: int) -> StateLayout:
-    """The layout of a task's recorded observations.
-
-    Args:
-        task: Any task of the table.
-        width: Numbers a row; tells the kitchen's two layouts apart.
-    """
-    names = observation_names(task)
-    if task.family == "kitchen":
-        names = names[:30]
-        if width != 59:
-            return StateLayout(names, tuple(range(30)), (), 29, lead=3, noisy=True, judged=9)
-        rates = tuple(f"{name.partition(' (')[0]} velocity" for name in names[:26])
-        rates += tuple(f"kettle spin about {axis}" for axis in "xyz")
-        columns = (*range(9), *range(18, 39)), (*range(9, 18), *range(39, 59))
-        return StateLayout((*names[:9], *rates[:9], *names[9:], *rates[9:]), *columns, 29, noisy=True, judged=18)
-    known = {"locomotion": (width - 1) // 2, "antmaze": 15, "pointmaze": 2}[task.family]
-    limit = 10.0 if task.base_name.partition("-")[0] in ("hopper", "walker2d") else np.inf
-    hidden = 1 if task.family == "locomotion" else 0
-    return StateLayout(names, tuple(range(known)), tuple(range(known, width)), width - known, hidden, limit)
-
-
 def draw_steps(spec: str, task: Task, count: int, seed: int = 0) -> RecordedSteps:
     """Draw steps from all over a recording; in locomotion a quarter of them end an episode, if so many do.
 
@@ -136,7 +79,7 @@ def draw_steps(spec: str, task: Task, count: int, seed: int = 0) -> RecordedStep
     if count < 1:
         raise UserError(f"steps to replay: found {count}, expected at least 1")
     rng = np.random.default_rng(seed)
-    with open_rows(spec, task, rng) as recording:
+    with open_recording(spec, task, rng) as recording:
         return _draw(recording, task, count, rng)
 
 
@@ -145,7 +88,7 @@ def draw_steps(spec: str, task: Task, count: int, seed: int = 0) -> RecordedStep
 
 def _draw(recording: Recording, task: Task, count: int, rng: np.random.Generator) -> RecordedSteps:
     layout = state_layout(task, recording.width)
-    falls = task.family == "locomotion"
+    falls = body_of(task).falls
     spare = SPARE if np.isfinite(layout.speed_limit) else 1
     rows, inner = [], []
     for episode, step in _choose(recording, layout.lead, count * spare, rng, falls=falls):

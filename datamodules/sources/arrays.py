@@ -1,9 +1,17 @@
-"""Reads what `Trajectories.save` wrote, memory-mapped."""
+"""`arrays:DIR`: what `Trajectories.save` wrote, memory-mapped."""
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datamodules.sources.source import Recording, Source, check_width
 from datamodules.trajectories import Trajectories
-from datamodules.validation import DataError
 from dds_lightning.tasks import Task
 
 
@@ -14,14 +22,39 @@ def load_arrays(directory: str, task: Task | None) -> Trajectories:
         DataError: When a file is damaged or a width is another task's.
     """
     trajectories = Trajectories.load(directory, mmap=True)
-    if task is not None:
-        for what, found, expected in (
-            ("observations", trajectories.observation_dim, task.observation_dim),
-            ("actions", trajectories.action_dim, task.action_dim),
-        ):
-            if found != expected:
-                raise DataError(
-                    f"data set '{trajectories.name}', {what}: found {found} columns, task '{task.name}' "
-                    f"needs {expected}"
-                )
+    where = f"data set '{trajectories.name}'"
+    check_width(where, task, trajectories.observation_dim, trajectories.action_dim)
     return trajectories
+
+
+@contextlib.contextmanager
+def open_arrays(directory: str, task: Task, rng: np.random.Generator) -> Iterator[Recording]:
+    """Open a folder of arrays for reading single rows; see `Source.open_rows`."""
+    yield _ArraysRows(load_arrays(directory, task))
+
+
+class _ArraysRows:
+    def __init__(self, data: Trajectories) -> None:
+        self.data, self.where, self.width = data, f"data set '{data.name}'", data.observation_dim
+        self.steps = self.known = data.lengths
+        self.ended = data.terminations[data.step_offsets[1:] - 1]
+
+    def states(self, episode: int, start: int, stop: int) -> NDArray[Any]:
+        first = self.data.observation_offsets[episode]
+        return self.data.observations[first + start : first + stop]
+
+    def taken(self, episode: int, start: int, stop: int) -> tuple[NDArray[Any], NDArray[Any]]:
+        rows = slice(self.data.step_offsets[episode] + start, self.data.step_offsets[episode] + stop)
+        return self.data.actions[rows], self.data.rewards[rows]
+
+    def inner(self, episode: int, step: int) -> None:
+        return None
+
+
+ARRAYS = Source(
+    rest="DIR",
+    about="a folder that `Trajectories.save` wrote",
+    load=load_arrays,
+    locate=lambda directory: Path(directory).expanduser(),
+    open_rows=open_arrays,
+)

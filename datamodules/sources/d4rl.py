@@ -1,4 +1,4 @@
-"""Reads D4RL's HDF5 files: flat rows of steps, without saying which environment they are from.
+"""`d4rl:FILE`: D4RL's HDF5 files, flat rows of steps that do not say which environment they are from.
 
 Row t holds the state before step t, its action, and what the step gave. The state after it is in row t + 1,
 unless the recording was cut there:
@@ -9,11 +9,11 @@ unless the recording was cut there:
     timeouts         -      -      -      1      -      -
     terminals        -      -      -      -      -      1
 
-    episode 0: s0 a0 s1 a1 s2 a2 s3          truncated; nobody knows where a3 led, so that step is left out
+    episode 0: s0 a0 s1 a1 s2 a2 s3          truncated; where a3 led is unknown, so that step is left out
     episode 1: s0' a0' s1' a1' s1'           terminated; see below
 
-A file with `next_observations` tells where each last step led, and loses none. Without them a *termination* is
-kept all the same: it tells the learner where the task ends. The state after it repeats the last one, and since
+A file with `next_observations` says where each last step led, so none is lost. Without them a *termination* is
+kept nevertheless: it shows the learner where the task ends. The state after it repeats the last one, and since
 nothing is bootstrapped from there, its value never counts.
 
 An episode ends at a terminal, at a time-out, at the end of the file, in mazes where the position jumps farther
@@ -38,11 +38,13 @@ computed afterwards, each from the position in the *next row*, whatever was reco
 So `terminals[t]` says that row t + 1 stands on the goal. Only where a recording ends without a time-out does a
 terminal mean what it means elsewhere: the episode was over then and there.
 
-Rewards stay as recorded; in the kitchen's files they count the subtasks done in the row's own state.
+Rewards stay as recorded; in the kitchen's files they count the subtasks done in the row's state.
 """
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,32 +54,34 @@ from numpy.typing import NDArray
 
 from datamodules.sources.fetch import find_d4rl
 from datamodules.sources.goal import cut_at_goal, ends_of
-from datamodules.sources.hdf5 import check_array, member, open_hdf5, read_array, read_rows, row_slices
+from datamodules.sources.hdf5 import array_in, check_array, member, open_hdf5, read_array, read_rows, row_slices
 from datamodules.sources.plausibility import refuse_other_task
+from datamodules.sources.source import Recording, Source, check_width
 from datamodules.trajectories import Trajectories
 from datamodules.validation import DataError, finite, in_box
 from datamodules.windows import ranges
 from dds_lightning.tasks import Task
+from dds_lightning.tasks.bodies import body_of
 
 FIELDS = ("observations", "actions", "rewards", "terminals")
-"""What every file has."""
+"""Arrays of every file."""
 
 FASTEST = 10.0
-"""Metres a second that no body of the mazes reaches; a farther jump between two rows is a reset."""
+"""Speed (m/s) that no body of the mazes reaches; a greater jump between two rows is a reset."""
 
 SAME = 1e-4
-"""Two records of one state differ by no more than this, absolutely or relatively."""
+"""Two records of one state differ by at most this, absolutely or relatively."""
 
 Flags = NDArray[np.bool_]
 Floats = NDArray[np.float32]
 
 
 def load_d4rl(name: str, task: Task | None) -> Trajectories:
-    """Read one of D4RL's files, or one's own in the same layout; nothing in it is ever run.
+    """Read one of D4RL's files, or another file in the same layout; nothing in it is ever run.
 
     Args:
-        name: Path of the file, or what `find_d4rl` knows.
-        task: The task that the data must fit; None checks only that they are sound.
+        name: Path of the file, or a name that `find_d4rl` knows.
+        task: The task that the data must fit; None only checks that they are valid.
 
     Raises:
         DataError: For anything missing, damaged, dangerous or of another task.
@@ -90,7 +94,7 @@ def load_d4rl(name: str, task: Task | None) -> Trajectories:
     if not (rows.last[:-1].any() or rows.terminals.any() or rows.timeouts.any()):
         raise DataError(
             f"{where}, terminals: none of the {len(rows.last)} rows is marked as an episode's last, there or in "
-            "timeouts; it holds no complete episode"
+            "timeouts; it has no complete episode"
         )
     return _episodes(rows, path.stem, where, low, high)
 
@@ -144,7 +148,7 @@ def _episodes(rows: _Rows, name: str, where: str, low: float, high: float) -> Tr
 
     first, final, reached = cut_at_goal(ended, np.diff(np.append(-1, end_of[last])))
     if not len(first):
-        raise DataError(f"{where}, observations: no row leads to another one, so it holds no complete episode")
+        raise DataError(f"{where}, observations: no row leads to another one, so it has no complete episode")
     lengths = final - first
     steps, states = row_of[ranges(first, lengths)], ranges(first, lengths + 1)
     observations = rows.observations[row_of[states]]
@@ -177,8 +181,8 @@ def _read(file: h5py.File, where: str, task: Task | None, low: float, high: floa
     observations = _numbers(fields["observations"], f"{where}, observations")
     if task is not None:
         refuse_other_task(where, observations, task)
-    # Without a task, the widths say it: no other body of the table has them.
-    walks_on = task.family == "antmaze" if task else (observations.shape[1], actions.shape[1]) == (29, 8)
+    # Without a task the widths decide: no other body of the table has them.
+    walks_on = body_of(task).walks_on if task else (observations.shape[1], actions.shape[1]) == (29, 8)
 
     last = timeouts.copy() if walks_on else timeouts | terminals
     last[-1] = True
@@ -205,7 +209,7 @@ def _fields(file: h5py.File, where: str, task: Task | None) -> dict[str, h5py.Da
     """The arrays that are read, checked for type, size and shape; `infos` and `metadata` are never touched."""
     found = list(file)
     if found and found[0].startswith("episode_"):
-        raise DataError(f"{where}: it is laid out as Minari's files are, one group an episode; read it with local:DIR")
+        raise DataError(f"{where}: it has the layout of Minari's files, one group per episode; read it with local:DIR")
     missing = [key for key in FIELDS if key not in found]
     if missing:
         raise DataError(f"{where}: '{missing[0]}' is missing; found {', '.join(found[:8]) or 'nothing'}")
@@ -223,11 +227,11 @@ def _fields(file: h5py.File, where: str, task: Task | None) -> dict[str, h5py.Da
             expected = f"(rows, {widths[key]})" if key in widths else "(rows, any)"
         if not fits:
             belongs = f" as task '{task.name}' has it" if task else ""
-            raise DataError(f"{where}, {key}: found shape {shape}, expected {expected}{belongs}")
+            raise DataError(f"{where}, {key}: got shape {shape}, expected {expected}{belongs}")
         if len(dataset) != rows:
-            raise DataError(f"{where}, {key}: found {len(dataset)} rows, but rewards has {rows}")
+            raise DataError(f"{where}, {key}: got {len(dataset)} rows, but rewards has {rows}")
     if rows == 0:
-        raise DataError(f"{where}, rewards: found 0 rows, expected at least 2")
+        raise DataError(f"{where}, rewards: got 0 rows, expected at least 2")
     return fields
 
 
@@ -236,12 +240,12 @@ def _flags(dataset: h5py.Dataset, where: str) -> Flags:
     array = read_array(dataset, where).reshape(-1)
     odd = np.flatnonzero((array != 0) & (array != 1))
     if len(odd):
-        raise DataError(f"{where}: found {array[odd[0]]} at row {odd[0]}, expected 0 or 1")
+        raise DataError(f"{where}: got {array[odd[0]]} at row {odd[0]}, expected 0 or 1")
     return array.astype(bool)
 
 
 def _numbers(dataset: h5py.Dataset, where: str, box: tuple[float, float] | None = None) -> Floats:
-    """Finite float32 numbers, read and checked part by part straight into their place."""
+    """Finite float32 numbers, read and checked part by part directly into the result."""
     array = np.empty(dataset.shape, np.float32)
     low, high = (np.full(array.shape[1], bound, np.float32) for bound in box or (0, 0))
     for start, stop in row_slices(dataset):
@@ -257,7 +261,7 @@ def _jumps(positions: NDArray[Any], farthest: float) -> Flags:
 
 def _following(dataset: h5py.Dataset, where: str, observations: Floats, last: Flags) -> Floats:
     """What follows each `last` row; rows that the next one does not follow are marked as `last`, in place."""
-    kept, strays = [], 0
+    parts, strays = [], 0
     for start, stop in row_slices(dataset):
         part = finite(where, read_rows(dataset, where, start, stop), first=start, unit="row")
         joined = min(stop, len(observations) - 1)
@@ -265,13 +269,13 @@ def _following(dataset: h5py.Dataset, where: str, observations: Floats, last: Fl
         stray = (np.abs(here - there) > SAME * (1 + np.abs(there))).any(axis=1) & ~last[start:joined]
         last[start:joined] |= stray
         strays += int(stray.sum())
-        kept.append(part[last[start:stop]])
+        parts.append(part[last[start:stop]])
     if strays > len(observations) / 10:
         raise DataError(
             f"{where}: {strays} of {len(observations)} rows differ from the next row's observations, though no episode "
             "ends there; the file mixes up its rows"
         )
-    return np.concatenate(kept)
+    return np.concatenate(parts)
 
 
 def _cut_at_cap(last: Flags, cap: int) -> None:
@@ -280,3 +284,66 @@ def _cut_at_cap(last: Flags, cap: int) -> None:
     starts = np.append(0, ends[:-1] + 1)
     within = np.arange(len(last)) - np.repeat(starts, ends - starts + 1)
     last |= within % cap == cap - 1
+
+
+# ---------------------------------------------------------------------- single rows
+
+
+@contextlib.contextmanager
+def open_d4rl(name: str, task: Task, rng: np.random.Generator) -> Iterator[Recording]:
+    """Open one of D4RL's files for reading single rows; see `Source.open_rows`."""
+    path = find_d4rl(name)
+    where = f"data set '{path.name}'"
+    with open_hdf5(path, where) as file:
+        yield _D4RLRows(file, where, task)
+
+
+class _D4RLRows:
+    """One of D4RL's files; no file says what follows an episode's last row."""
+
+    def __init__(self, file: h5py.File, where: str, task: Task) -> None:
+        self.where = where
+        keys = ["observations", "actions", "rewards", "terminals", *(["timeouts"] if "timeouts" in list(file) else [])]
+        self.fields = {key: array_in(file, key, where) for key in keys}
+        count = len(self.fields["rewards"])
+        for key, field in self.fields.items():
+            if len(field) != count or field.ndim != (2 if key in ("observations", "actions") else field.ndim):
+                raise DataError(f"{where}, {key}: got shape {field.shape}, but rewards has {count} rows")
+        self.width = self.fields["observations"].shape[1]
+        check_width(where, task, self.width, self.fields["actions"].shape[1])
+        self.inner_state = self._inner_state(file, count)
+        flags = {key: read_array(self.fields[key], f"{where}, {key}").reshape(-1) > 0 for key in keys[3:]}
+        # D4RL's ants walk on through the goal, where rewards and terminals were computed afterwards.
+        last = flags.get("timeouts", np.zeros(count, bool)) | (flags["terminals"] & (not body_of(task).walks_on))
+        last[-1:] = True
+        ends = np.flatnonzero(last)
+        self.first = np.append(0, ends[:-1] + 1)
+        self.steps = ends - self.first + 1
+        self.known = self.steps - 1
+        self.ended = flags["terminals"][ends]
+
+    def _inner_state(self, file: h5py.File, count: int) -> list[h5py.Dataset]:
+        """`infos/qpos` and `infos/qvel`, where the file has both."""
+        infos = member(file, "infos", self.where) if "infos" in list(file) else None
+        if not isinstance(infos, h5py.Group) or not {"qpos", "qvel"} <= set(infos):
+            return []
+        found = [array_in(infos, key, f"{self.where}, infos") for key in ("qpos", "qvel")]
+        return found if all(field.ndim == 2 and len(field) == count for field in found) else []
+
+    def states(self, episode: int, start: int, stop: int) -> NDArray[Any]:
+        return self._rows("observations", episode, start, stop)
+
+    def taken(self, episode: int, start: int, stop: int) -> tuple[NDArray[Any], NDArray[Any]]:
+        rewards = self._rows("rewards", episode, start, stop)
+        return self._rows("actions", episode, start, stop), rewards.reshape(-1)
+
+    def _rows(self, key: str, episode: int, start: int, stop: int) -> NDArray[Any]:
+        first = int(self.first[episode])
+        return read_rows(self.fields[key], f"{self.where}, {key}", first + start, first + stop)
+
+    def inner(self, episode: int, step: int) -> Any:
+        row = int(self.first[episode]) + step
+        return tuple(read_rows(field, f"{self.where}, infos", row, row + 1)[0] for field in self.inner_state) or None
+
+
+D4RL = Source("FILE", "an HDF5 file in D4RL's layout", load_d4rl, find_d4rl, open_d4rl)

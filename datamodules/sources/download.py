@@ -1,4 +1,8 @@
-"""Downloads one file: with progress, on from where it was cut, and whole or not at all."""
+"""Downloads one file: with progress, resumed where it was cut off, and complete or not at all.
+
+None of the project's dependencies resumes a download from any server: urllib and torch.hub start from nothing again,
+and a data set of D4RL has hundreds of megabytes.
+"""
 
 from __future__ import annotations
 
@@ -22,41 +26,41 @@ from dds_lightning.errors import UserError
 from dds_lightning.saving.files import sync
 
 ATTEMPTS = 5
-"""Tries in a row; each goes on where the one before was cut."""
+"""Attempts in a row; each continues where the one before was cut off."""
 
 PAUSE = 2.0
-"""Seconds between two tries."""
+"""Seconds between two attempts."""
 
 PATIENCE = 30.0
-"""Seconds that a server may be silent."""
+"""Seconds to wait for an answer from the server."""
 
 BLOCK = 2**16
 """Bytes written at a time."""
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
-"""What every HDF5 file begins with."""
+"""First bytes of every HDF5 file."""
 
 Show = Callable[[int, int | None], None]
-"""Told the bytes that are there and the bytes in all, None where the server does not say."""
+"""Called with the bytes received and the bytes in all, None if the server does not say."""
 
 
 class _CutError(Exception):
-    """The network failed; another try may do better."""
+    """The network failed; another attempt may succeed."""
 
 
 def download(url: str, target: Path) -> Path:
     """Fetch `url` into the file `target`, unless that is there already.
 
-    What arrives goes into `target.part`, with its address and size beside it in `target.part.json`, and takes
-    its name when it is complete. A later call asks the server for the rest (HTTP Range) and starts anew where
-    the server cannot, or where its file has changed.
+    What arrives is written to `target.part`, with its address and size beside it in `target.part.json`, and renamed
+    when it is complete. A later call requests the rest from the server (HTTP Range), and starts again if the server
+    cannot send it or its file has changed.
 
     Returns:
         `target`.
 
     Raises:
-        UserError: Without a network, when the server refuses, when there is no room, or when what came is not
-            as long as announced or no HDF5 file. What has arrived of a good file is kept.
+        UserError: Without a network, when the server refuses, when the disk is full, or when what arrived does not have
+            the announced length or is not an HDF5 file. What has arrived of a valid file is kept.
     """
     if target.is_file():
         return target
@@ -70,11 +74,11 @@ def download(url: str, target: Path) -> Path:
 
 @dataclass(frozen=True)
 class _Download:
-    """One file on its way.
+    """The download of one file.
 
     Attributes:
-        url: From where.
-        target: To where.
+        url: Source.
+        target: Destination.
     """
 
     url: str
@@ -82,17 +86,17 @@ class _Download:
 
     @property
     def part(self) -> Path:
-        """What has arrived so far."""
+        """The file with what has arrived so far."""
         return self.target.with_name(f"{self.target.name}.part")
 
     @property
     def facts(self) -> Path:
-        """What `part` is a part of."""
+        """The file that describes what `part` is a part of."""
         return self.target.with_name(f"{self.target.name}.part.json")
 
     @property
     def arrived(self) -> int:
-        """Bytes so far."""
+        """Bytes that have arrived so far."""
         return self.part.stat().st_size if self.part.is_file() else 0
 
     def run(self) -> None:
@@ -113,25 +117,25 @@ class _Download:
         self.facts.unlink(missing_ok=True)
 
     def _remedy(self) -> str:
-        kept = f"the {self.arrived:,} bytes that came are kept, the same command goes on there"
+        kept = f"the {self.arrived:,} bytes that arrived are kept, and the same command continues there"
         return (
             f"{kept if self.arrived else 'nothing was lost, try again when it can be reached'}; or download it "
             f"elsewhere and put it at {self.target}"
         )
 
     def _transfer(self, show: Show) -> None:
-        """One request for what is missing."""
+        """Request once what is missing."""
         known = self._known()
         start = self.arrived if known else 0
         response = self._open(start, known)
-        if response is None:  # the server has nothing beyond what has arrived
+        if response is None:  # the server has no more than what has arrived
             if start != known["size"]:
-                self._start_anew()
+                self._start_again()
             return
         with response:
-            start, size = self._place(response, start)
+            start, size = self._range_of(response, start)
             if start and size != known["size"]:
-                self._start_anew()
+                self._start_again()
             free = shutil.disk_usage(self.part.parent).free
             if size is not None and size - start > free:
                 raise UserError(
@@ -144,19 +148,19 @@ class _Download:
                 self.facts.write_text(json.dumps(facts), encoding="utf-8")
                 _copy(response, file, size, show)
         if size is not None and self.arrived != size:
-            raise _CutError(f"{self.arrived:,} of {size:,} bytes came")
+            raise _CutError(f"{self.arrived:,} of {size:,} bytes arrived")
 
     def _known(self) -> dict[str, Any]:
-        """What the part is of; nothing where that is another address."""
+        """Description of what has arrived; empty if it came from another address."""
         with contextlib.suppress(OSError, ValueError):
             facts = json.loads(self.facts.read_text(encoding="utf-8"))
             if isinstance(facts, dict) and facts.get("url") == self.url and isinstance(facts.get("size"), int):
                 return facts
         return {}
 
-    def _start_anew(self) -> NoReturn:
+    def _start_again(self) -> NoReturn:
         self.part.unlink(missing_ok=True)
-        raise _CutError("the file on the server has changed, what had come of the old one was deleted")
+        raise _CutError("the file on the server has changed, and what had arrived of the old one was deleted")
 
     def _open(self, start: int, known: dict[str, Any]) -> Any:
         """The server's answer; None when there is nothing from `start` on."""
@@ -167,7 +171,7 @@ class _Download:
             if isinstance(validator, str) and not validator.startswith("W/"):
                 headers["If-Range"] = validator
         try:
-            # The address is one of our own table, never a user's: no other scheme can be smuggled in.
+            # The address comes from our table, never from a user: no other scheme can be smuggled in.
             request = urllib.request.Request(self.url, headers=headers)  # noqa: S310
             return urllib.request.urlopen(request, timeout=PATIENCE)  # noqa: S310
         except urllib.error.HTTPError as error:
@@ -181,23 +185,25 @@ class _Download:
         except (OSError, HTTPException) as error:
             raise _CutError(str(getattr(error, "reason", error)) or type(error).__name__) from error
 
-    def _place(self, response: Any, start: int) -> tuple[int, int | None]:
-        """Where the answer begins in the file, and how long the file is."""
+    def _range_of(self, response: Any, start: int) -> tuple[int, int | None]:
+        """Where the answer begins in the file, and the length of the file."""
         if response.status != HTTPStatus.PARTIAL_CONTENT:
             length = response.headers.get("Content-Length", "")
             return 0, int(length) if length.isdigit() else None
         found = re.fullmatch(r"bytes (\d+)-\d+/(\d+)", response.headers.get("Content-Range", ""))
         if found is None or int(found[1]) != start:
-            self._start_anew()
+            self._start_again()
         return start, int(found[2])
 
     def _refuse_foreign(self) -> None:
-        """Some networks answer every request with a page of their own."""
+        """Refuse what is not HDF5: some networks answer every request with a web page."""
         with self.part.open("rb") as file:
             first = file.read(len(HDF5))
         if self.target.suffix == ".hdf5" and first != HDF5:
             self.part.unlink()
-            raise UserError(f"fetch: what {self.url} sent is no HDF5 file (it begins with {first!r}) and was deleted")
+            raise UserError(
+                f"fetch: {self.url} sent something other than an HDF5 file, which was deleted; it began with {first!r}"
+            )
 
 
 def _copy(response: Any, file: BinaryIO, size: int | None, show: Show) -> None:
@@ -214,15 +220,13 @@ def _copy(response: Any, file: BinaryIO, size: int | None, show: Show) -> None:
 
 @contextlib.contextmanager
 def _progress(name: str) -> Iterator[Show]:
-    """A bar on a terminal's standard error, two lines where that is a file."""
+    """A bar where standard error is a terminal, one line elsewhere."""
     if not sys.stderr.isatty():
         print(f"fetching {name}", file=sys.stderr, flush=True)
         yield lambda done, size: None
         return
-    from rich.console import Console
-    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+    from dds_lightning.console.progress import progress_bar
 
-    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
-    with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as progress:
-        line = progress.add_task(name, total=None)
-        yield lambda done, size: progress.update(line, completed=done, total=size)
+    layout = ("{task.description}", "bar", "bytes", "speed", "remaining")
+    with progress_bar(layout, None, name, transient=False) as update:
+        yield lambda done, size: update(completed=done, total=size)

@@ -1,9 +1,8 @@
-"""Where published data sets lie, on their servers and on this machine. Downloading runs nothing of theirs."""
+"""Finds published data sets, on their servers and on this machine. Downloading never runs code from a data set."""
 
 from __future__ import annotations
 
 import os
-import re
 import shutil
 from pathlib import Path
 from urllib.parse import quote
@@ -13,19 +12,17 @@ from datamodules.validation import DataError
 from dds_lightning.errors import UserError
 from dds_lightning.saving.files import neighbours
 from dds_lightning.tasks import Task, get_task, task_names
+from dds_lightning.tasks.bodies import body_of
 
 D4RL_SERVER = "http://rail.eecs.berkeley.edu/datasets/offline_rl"
-"""D4RL's public server. It has no encryption and publishes no hashes; files are checked when they are read."""
-
-D4RL_SETS = {"locomotion": ("gym_mujoco_v2", "v2"), "antmaze": ("ant_maze_v2", "v2"), "kitchen": ("kitchen", "v0")}
-"""Family -> folder on D4RL's server, and the version that D4RL's names of its files end in."""
+"""D4RL's public server. It offers neither encryption nor hashes; files are checked when they are read."""
 
 MINARI_SERVER = "https://huggingface.co/datasets/farama-minari"
-"""Where Minari publishes its data sets: a repository a name space, a folder a data set."""
+"""Where Minari publishes its data sets: a repository per name space, a folder per data set."""
 
 
 def fetch(task_name: str, source: str = "d4rl", out: str | Path | None = None) -> Path:
-    """Download the data set that a source publishes for a task; after a cut, call again.
+    """Download the data set that a source publishes for a task; a repeated call continues an interrupted one.
 
     Args:
         task_name: A task of the table.
@@ -43,7 +40,7 @@ def fetch(task_name: str, source: str = "d4rl", out: str | Path | None = None) -
         return fetch_d4rl(get_task(task_name), out)
     if source == "minari":
         return fetch_minari(_published(get_task(task_name), "minari"), out)
-    raise UserError(f"source: found '{source}', expected d4rl or minari")
+    raise UserError(f"source: got '{source}', expected d4rl or minari")
 
 
 def fetch_d4rl(task: Task, folder: str | Path | None = None) -> Path:
@@ -57,16 +54,15 @@ def fetch_d4rl(task: Task, folder: str | Path | None = None) -> Path:
         UserError: See `datamodules.sources.download.download`.
     """
     name = _published(task, "d4rl")
-    url = f"{D4RL_SERVER}/{D4RL_SETS[task.family][0]}/{quote(name)}"
+    url = f"{D4RL_SERVER}/{_d4rl(task)[0]}/{quote(name)}"
     return download(url, Path(folder or d4rl_root()).expanduser() / name)
 
 
 def fetch_minari(dataset_id: str, root: str | Path | None = None) -> Path:
     """Download a data set that Minari publishes, unless it is there already.
 
-    Its two files are fetched directly: Minari's own downloader runs nothing of theirs either, but needs one more
-    package, and here the metadata are checked before the rest is fetched. The data set takes its name when both
-    are complete.
+    Its two files are fetched directly: Minari's downloader runs no foreign code either, but needs one more package, and
+    here the metadata are checked before the rest is fetched. The data set gets its name when both are complete.
 
     Args:
         dataset_id: Minari's id.
@@ -76,11 +72,9 @@ def fetch_minari(dataset_id: str, root: str | Path | None = None) -> Path:
         UserError: See `datamodules.sources.download.download`.
         DataError: For metadata that `load_trajectories` would refuse.
     """
-    from datamodules.sources.minari import minari_root, read_metadata
+    from datamodules.sources.minari import check_minari_id, minari_root, read_metadata
 
-    if not re.fullmatch(r"[\w-]+(/[\w-]+)*", dataset_id):
-        raise UserError(f"data: '{dataset_id}' is no Minari id; one is pointmaze-large-diverse-v0")
-    folder = Path(root or minari_root()).expanduser() / dataset_id
+    folder = Path(root or minari_root()).expanduser() / check_minari_id(dataset_id)
     if folder.exists():
         return folder
     repository, _, inner = dataset_id.partition("/")
@@ -134,14 +128,21 @@ def find_d4rl(name: str) -> Path:
             return folder / candidate
     remedy = f"get it with `dds data fetch {task.name}`" if task else "give its path"
     raise DataError(
-        f"data set '{name}': there is no such file here nor in {folder}, which D4RL_DATASET_DIR sets; {remedy}, or "
+        f"data set '{name}': there is no such file here or in {folder}, which D4RL_DATASET_DIR sets; {remedy}, or "
         "put the file there by hand"
     )
 
 
 def _names(task: Task) -> tuple[str, ...]:
-    """What a task's file is called: file, task, and D4RL's name."""
+    """Names of a task's file: of the file, of the task, and D4RL's."""
     file = task.data_ids.get("d4rl")
     if file is None:
         return ()
-    return file, file.removesuffix(".hdf5"), task.name, f"{task.name}-{D4RL_SETS[task.family][1]}"
+    return file, file.removesuffix(".hdf5"), task.name, f"{task.name}-{_d4rl(task)[1]}"
+
+
+def _d4rl(task: Task) -> tuple[str, str]:
+    """Folder on D4RL's server, and the version that the names of its files end in."""
+    found = body_of(task).d4rl
+    assert found is not None, "a row with a D4RL file has a robot of D4RL's"
+    return found

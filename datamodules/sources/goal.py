@@ -11,11 +11,11 @@ from dds_lightning.tasks import Task
 
 
 def relabel_to_goal(trajectories: Trajectories, task: Task) -> Trajectories:
-    """Give every step the reward of the task's own goal, and end episodes where it is reached.
+    """Give every step the reward of the task's goal, and end episodes where it is reached.
 
     `r_t = 1` if the position after step t lies within `goal_radius` of the goal, else 0. Reaching the goal
-    ends the episode (termination); what follows begins anew outside, see `cut_at_goal`. Terminations of other
-    goals become truncations: for this task nothing ended there.
+    ends the episode (termination); what follows becomes a new episode that starts outside it, see
+    `cut_at_goal`. Terminations of other goals become truncations: for this task nothing ended there.
 
     Args:
         trajectories: Positions are the first two columns of the observations.
@@ -29,21 +29,21 @@ def relabel_to_goal(trajectories: Trajectories, task: Task) -> Trajectories:
 
 
 def cut_at_arrivals(trajectories: Trajectories, task: Task) -> Trajectories:
-    """End episodes where the recording was rewarded for reaching its goal; what follows begins anew outside.
+    """End episodes where the recording was rewarded for reaching its goal; what follows is a new episode.
 
-    For data whose goal lies somewhere else in every recording (D4RL's AntMaze draws it): the rewards say where.
+    For data whose goal differs from recording to recording (D4RL's AntMaze draws it): the rewards show where it is.
 
     Args:
         trajectories: Rewards are 1 where a step leads to the goal, else 0.
         task: A maze task.
 
     Raises:
-        DataError: When rewards are others, or every recorded state lies on the goal.
+        DataError: When there are other rewards, or every recorded state lies on the goal.
     """
     odd = trajectories.rewards[(trajectories.rewards != 0) & (trajectories.rewards != 1)]
     if len(odd):
         raise DataError(
-            f"data set '{trajectories.name}', rewards: found {odd[0]:g}, expected 0 or 1 (on the goal) for task "
+            f"data set '{trajectories.name}', rewards: got {odd[0]:g}, expected 0 or 1 (on the goal) for task "
             f"'{task.name}'"
         )
     inside = np.zeros(len(trajectories.observations), bool)
@@ -79,8 +79,8 @@ def cut_at_goal(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
     """Cut recorded episodes into those that end where the goal is first reached.
 
-    What follows an arrival is a new episode, which begins with the first state outside: nobody acts from a
-    state where the task has ended, and standing on the goal is never paid twice.
+    What follows an arrival is a new episode, which begins with the first state outside: no action starts from a state
+    where the task has ended, and standing on the goal is never rewarded twice.
 
         outside outside INSIDE inside inside outside outside
         └── terminated ──────┘ └─ left out ┘ └─ new episode ...

@@ -1,8 +1,8 @@
 """Reads arrays of numbers from HDF5 files of strangers.
 
-HDF5 can point at other files of the reader's machine, load filters as plug-ins (which is foreign code), store
-Python objects, and declare arrays of any size in a few bytes. A file of trajectories needs none of that, so
-here only plain numbers are read, which the file itself holds, at the size that they have in it.
+HDF5 can point at other files on the reader's machine, load filters as plug-ins (which is foreign code), store
+Python objects, and declare arrays of any size in a few bytes. h5py and Minari allow all of that. A file of trajectories
+needs none of it, so this module reads only plain numbers that the file itself holds, at the size they have in it.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32", 5: "n-bit", 6: "scale-offse
 """Filters that need no plug-in."""
 
 SMALL = 64 * 2**20
-"""Bytes that any array may take, however well it is compressed: a million zeros are honest data."""
+"""Bytes that any array may have, however well it is compressed: a million zeros are legitimate data."""
 
 MAX_RATIO = 50
-"""Times that a larger array may be compressed. Measured numbers shrink to a tenth at best."""
+"""Greatest compression of a larger array. Measurements shrink to a tenth at best."""
 
 SLICE = 8 * 2**20
 """Bytes read at a time."""
@@ -45,14 +45,14 @@ def open_hdf5(path: Path, where: str) -> Iterator[h5py.File]:
         where: The data set, as messages begin.
 
     Raises:
-        DataError: When the file is missing, damaged or no HDF5.
+        DataError: When the file is missing, damaged or not HDF5.
     """
     if not path.is_file():
         raise DataError(f"{where}: {path} is {'a folder' if path.is_dir() else 'missing'}{neighbours(path)}")
     try:
         file = h5py.File(path, "r")
     except _DAMAGE as error:
-        kind = "" if h5py.is_hdf5(path) else ", or no HDF5 file at all"
+        kind = "" if h5py.is_hdf5(path) else ", or not an HDF5 file at all"
         raise DataError(f"{where}: {path} is truncated or damaged{kind} ({error})") from error
     with file:
         try:
@@ -64,7 +64,7 @@ def open_hdf5(path: Path, where: str) -> Iterator[h5py.File]:
 
 
 def member(group: h5py.Group, key: str, where: str) -> Any:
-    """A member that is stored in this very file: links may point at any file of the reader's machine.
+    """A member that is stored in this file itself: links may point at any file on the reader's machine.
 
     Raises:
         DataError: When it is a link, stored elsewhere or damaged.
@@ -82,8 +82,32 @@ def member(group: h5py.Group, key: str, where: str) -> Any:
     return node
 
 
+def group_in(group: h5py.Group, key: str, where: str) -> h5py.Group:
+    """A member that must be a group.
+
+    Raises:
+        DataError: When it is an array, a link, stored elsewhere or damaged.
+    """
+    node = member(group, key, where)
+    if not isinstance(node, h5py.Group):
+        raise DataError(f"{where}, {key}: got an array, expected a group")
+    return node
+
+
+def array_in(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
+    """A member that must be an array of numbers, see `check_array`.
+
+    Raises:
+        DataError: When it is missing, a link, stored elsewhere, or refused by `check_array`.
+    """
+    found = list(group)
+    if key not in found:
+        raise DataError(f"{where}: '{key}' is missing; found {', '.join(found[:8]) or 'nothing'}")
+    return check_array(member(group, key, where), f"{where}, {key}")
+
+
 def check_array(node: Any, where: str) -> h5py.Dataset:
-    """Refuse what is no plain array of numbers, or larger than its file can hold. Reads no data.
+    """Refuse anything but a plain array of numbers that fits into its file. Reads no data.
 
     Args:
         node: From `member`.
@@ -94,7 +118,7 @@ def check_array(node: Any, where: str) -> h5py.Dataset:
             need plug-ins, and arrays whose declared size the file does not hold.
     """
     if not isinstance(node, h5py.Dataset):
-        raise DataError(f"{where}: found a group, expected an array")
+        raise DataError(f"{where}: got a group, expected an array")
     try:
         _check_type(node, where)
         _check_filters(node, where)
@@ -108,13 +132,13 @@ def check_array(node: Any, where: str) -> h5py.Dataset:
 
 def _check_type(dataset: h5py.Dataset, where: str) -> None:
     if not dataset.shape:
-        raise DataError(f"{where}: found {'nothing' if dataset.shape is None else 'one value'}, expected an array")
+        raise DataError(f"{where}: got {'nothing' if dataset.shape is None else 'one value'}, expected an array")
     try:
         kind = dataset.dtype
     except (TypeError, ValueError) as error:
-        raise DataError(f"{where}: found values of a type unknown to NumPy, expected real numbers") from error
+        raise DataError(f"{where}: got values of a type unknown to NumPy, expected real numbers") from error
     if kind.kind not in "biuf" or kind.subdtype is not None:
-        raise DataError(f"{where}: found values of type {kind}, expected real numbers")
+        raise DataError(f"{where}: got values of type {kind}, expected real numbers")
 
 
 def _check_filters(dataset: h5py.Dataset, where: str) -> None:
@@ -129,7 +153,7 @@ def _check_filters(dataset: h5py.Dataset, where: str) -> None:
 
 
 def _check_size(dataset: h5py.Dataset, where: str) -> None:
-    """Compare what is declared with what is stored: HDF5 makes up zeros for whatever is not."""
+    """Compare the declared with the stored size: HDF5 fills in zeros for what is not stored."""
     shape, item = dataset.shape, dataset.id.get_type().get_size()
     declared = math.prod(shape) * item
     stored, whole = dataset.id.get_storage_size(), Path(dataset.file.filename).stat().st_size
@@ -147,7 +171,7 @@ def _check_size(dataset: h5py.Dataset, where: str) -> None:
     if max(declared, expected * math.prod(dataset.chunks) * item) > limit:
         raise DataError(
             f"{claim} but its file holds {_size(stored)} of it; more than {MAX_RATIO} times smaller than the "
-            "numbers themselves is not believed"
+            "numbers themselves is not plausible"
         )
     found = dataset.id.get_num_chunks()
     if found != expected:
@@ -163,17 +187,17 @@ def _size(count: float) -> str:
 
 
 def read_array(node: Any, where: str) -> NDArray[Any]:
-    """A whole array, after `check_array`.
+    """A complete array, after `check_array`.
 
     Raises:
-        DataError: Likewise.
+        DataError: See `check_array`.
     """
     dataset = check_array(node, where)
     return read_rows(dataset, where, 0, len(dataset))
 
 
 def read_rows(dataset: h5py.Dataset, where: str, start: int, stop: int, columns: int | None = None) -> NDArray[Any]:
-    """Rows `start` to `stop` of a dataset that `check_array` has passed, of a matrix the first `columns` alone.
+    """Rows `start` to `stop` of a dataset that `check_array` has passed, of a matrix only the first `columns`.
 
     Raises:
         DataError: When the file is damaged there.
@@ -185,7 +209,7 @@ def read_rows(dataset: h5py.Dataset, where: str, start: int, stop: int, columns:
 
 
 def row_slices(dataset: h5py.Dataset) -> Iterator[tuple[int, int]]:
-    """Ranges of rows of about `SLICE` bytes, in whole blocks of the file, so that each is unpacked once."""
+    """Ranges of rows of about `SLICE` bytes, in complete blocks of the file, so that each is unpacked once."""
     rows, row_bytes = len(dataset), max(1, dataset.dtype.itemsize * math.prod(dataset.shape[1:]))
     block = dataset.chunks[0] if dataset.chunks else 1
     count = max(1, SLICE // (row_bytes * block)) * block

@@ -1,15 +1,15 @@
-"""Judges the `metadata.json` of a Minari data set; nothing that it names is ever run.
+"""Checks the `metadata.json` of a Minari data set; nothing that it names is ever run.
 
-Minari's own loader builds environments from this file, and with them whatever callable it names. Here it is
-only text, which has to be the text that an honest recording of one of our environments has:
+Minari's loader builds environments from this file, and thereby runs whatever callable it names. Here it is only
+text, which must be what a genuine recording of one of our environments contains:
 
 | entry | must be |
 |---|---|
-| both spaces | there (Minari runs the environment to find them out), and those of the task |
+| both spaces | present (Minari would run the environment to find them out), and those of the task |
 | `env_spec`: id | an environment of the task table |
 | entry points, `eval_env_spec`'s too | what Gymnasium has registered under that id |
-| wrappers | ones that only watch |
-| arguments | ones that leave the physics alone, or the registered values |
+| wrappers | only ones that observe |
+| arguments | only ones that do not change the physics, or the registered values |
 | walls, subtasks | the task's |
 """
 
@@ -23,14 +23,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.sources.observations import Layout, box_shape, find_layout, space_in_words, task_layout
+from datamodules.sources.observations import Layout, box_shape, describe_space, find_layout, task_layout
 from datamodules.validation import DataError
 from dds_lightning.envs.kitchen import SUBTASKS
 from dds_lightning.saving.files import neighbours
 from dds_lightning.tasks import Task, known_env_ids
 
 MAX_BYTES = 2**20
-"""Size of a metadata.json; honest ones have a few thousand bytes."""
+"""Greatest size of a metadata.json; genuine ones have a few thousand bytes."""
 
 HARMLESS = frozenset(
     {
@@ -41,7 +41,7 @@ HARMLESS = frozenset(
         *("render_mode", "width", "height", "camera_id", "camera_name", "default_camera_config"),
     }
 )
-"""Arguments of environments that change neither physics nor the rewards that are learnt."""
+"""Arguments of environments that change neither the physics nor the rewards that are learnt from."""
 
 _WATCHING = re.compile(
     r"gymnasium\.wrappers\.\w+:(OrderEnforcing|PassiveEnvChecker|RecordEpisodeStatistics|RecordVideo|TimeLimit)"
@@ -50,14 +50,14 @@ _WATCHING = re.compile(
 
 
 def read_metadata(data: Path) -> dict[str, Any]:
-    """Read a data set's metadata.json and refuse what no honest recording says.
+    """Read a data set's metadata.json and refuse what no genuine recording contains.
 
     Args:
         data: Folder with `metadata.json` and `main_data.hdf5`.
 
     Returns:
-        The file's entries. `dataset_id` is fit for messages; both spaces are parsed; `env_spec` is None or holds
-        `id` and `kwargs`; `total_episodes` and `total_steps` are counts where they are told.
+        The file's entries. `dataset_id` is safe to print; both spaces are parsed; `env_spec` is None or has `id`
+        and `kwargs`; `total_episodes` and `total_steps` are counts where they are present.
 
     Raises:
         DataError: When it is missing, damaged, lacks a space, or names an unknown environment or foreign
@@ -65,7 +65,7 @@ def read_metadata(data: Path) -> dict[str, Any]:
     """
     path = data / "metadata.json"
     if not path.is_file():
-        raise DataError(f"data: {path} is missing, so {data} holds no Minari data set{neighbours(path)}")
+        raise DataError(f"data: {path} is missing, so {data} is not a Minari data set{neighbours(path)}")
     if path.stat().st_size > MAX_BYTES:
         raise DataError(f"data: {path} has {path.stat().st_size:,} bytes, expected at most {MAX_BYTES:,}")
     try:
@@ -99,14 +99,14 @@ def _parse(text: Any, where: str) -> dict[str, Any]:
     try:
         value = json.loads(text)
     except (ValueError, TypeError, RecursionError) as error:
-        raise DataError(f"{where} is damaged: it holds no JSON object ({_short(error)})") from error
+        raise DataError(f"{where} is damaged: it is not a JSON object ({_short(error)})") from error
     if not isinstance(value, dict):
-        raise DataError(f"{where} is damaged: it holds {_short(value)}, expected a JSON object")
+        raise DataError(f"{where} is damaged: expected a JSON object, got {_short(value)}")
     return value
 
 
 def _name(metadata: dict[str, Any], data: Path) -> str:
-    """What messages call the data set: its id, if that is one, else its folder."""
+    """Name of the data set in messages: its id if that is valid, else its folder."""
     name = metadata.get("dataset_id")
     folder = data.parent.name if data.name == "data" else data.name
     return name if isinstance(name, str) and re.fullmatch(r"\w[\w./-]{0,99}", name) and ".." not in name else folder
@@ -120,11 +120,11 @@ def _judge_env(name: str, key: str, text: Any) -> dict[str, Any] | None:
     spec = _parse(text, where)
     env_id, arguments, wrappers = spec.get("id"), spec.get("kwargs") or {}, spec.get("additional_wrappers") or []
     if not isinstance(arguments, dict) or not isinstance(wrappers, list):
-        raise DataError(f"{where} is damaged: its kwargs or additional_wrappers are no object and no list")
+        raise DataError(f"{where} is damaged: expected an object for kwargs and a list for additional_wrappers")
     for wrapper in wrappers:
         code = wrapper.get("entry_point") if isinstance(wrapper, dict) else wrapper
         if not isinstance(code, str) or not _WATCHING.fullmatch(code):
-            raise _foreign(name, key, code, "no wrappers but those of gymnasium.wrappers that only watch")
+            raise _foreign(name, key, code, "only wrappers of gymnasium.wrappers that observe")
     registered = _registered(name, env_id)
     for entry in ("entry_point", "vector_entry_point"):
         if spec.get(entry) not in (None, getattr(registered, entry)):
@@ -140,13 +140,13 @@ def _foreign(name: str, key: str, found: Any, expected: str) -> DataError:
 
 
 def _registered(name: str, env_id: Any) -> Any:
-    """Gymnasium's own specification of an environment of the task table."""
+    """Gymnasium's specification of an environment of the task table."""
     if not isinstance(env_id, str) or env_id not in known_env_ids():
         raise DataError(
             f"data set '{name}': it was recorded in {_short(env_id)}, which no task uses; see `dds tasks`, or, for a "
             "robot of your own, write the data without an environment (no env_spec in metadata.json) or give arrays:DIR"
         )
-    import gymnasium as gym  # slow, and not needed where a data set is no good anyway
+    import gymnasium as gym  # slow, and not needed for data sets that are refused earlier
 
     from dds_lightning.envs.build import register_environments
 
@@ -163,10 +163,10 @@ def _judge_arguments(name: str, env: dict[str, Any]) -> None:
     registered = json.loads(json.dumps(_registered(name, env["id"]).kwargs))
     for key, value in env["kwargs"].items():
         if key not in HARMLESS and not (key in registered and registered[key] == value):
-            expected = f"{key} = {_short(registered[key])}" if key in registered else f"none of the name {_short(key)}"
+            expected = f"{key} = {_short(registered[key])}" if key in registered else f"no argument {_short(key)}"
             raise DataError(
-                f"data set '{name}': it was recorded with the argument {one_line(key)} = {_short(value)}, so in other "
-                f"physics or for other rewards than {env['id']} has, which takes {expected}"
+                f"data set '{name}': it was recorded with the argument {one_line(key)} = {_short(value)}, so with "
+                f"other physics or rewards than those of {env['id']}, which has {expected}"
             )
     if not _is_names(env["kwargs"].get("tasks_to_complete", [])):
         found = _short(env["kwargs"]["tasks_to_complete"])
@@ -181,14 +181,14 @@ def _is_names(value: Any) -> bool:
 
 
 def check_task(metadata: dict[str, Any], task: Task) -> None:
-    """Refuse data of other walls, other subtasks or unknown origin.
+    """Refuse data with other walls, other subtasks or of unknown origin.
 
     Args:
         metadata: From `read_metadata`.
-        task: From `resolve_task`, so that it takes data of this environment.
+        task: From `resolve_task`, so that it accepts data of this environment.
 
     Raises:
-        DataError: When the recording is not the task's.
+        DataError: When the recording is not of the task.
     """
     name, env = metadata["dataset_id"], metadata["env_spec"]
     if env is None:
@@ -208,7 +208,7 @@ def check_task(metadata: dict[str, Any], task: Task) -> None:
     if task.subtasks and recorded is not None and set(recorded) != set(task.subtasks):
         raise DataError(
             f"data set '{name}' was recorded for the subtasks {one_line(', '.join(recorded))}, but task "
-            f"'{task.name}' has {', '.join(task.subtasks)}; choose the task that fits the data, or other data"
+            f"'{task.name}' has {', '.join(task.subtasks)}; choose a task that fits the data, or other data"
         )
 
 
@@ -220,21 +220,21 @@ def _walls(maze_map: Any) -> tuple[str, ...]:
 
 
 def observation_layout(metadata: dict[str, Any], task: Task | None) -> Layout:
-    """How to read the observations, as their space says it.
+    """How to read the observations, from their space.
 
     Args:
         metadata: From `read_metadata`.
-        task: Whose recordings they must be; None takes any layout that we know.
+        task: The task whose layout they must have; None accepts every known layout.
 
     Raises:
-        DataError: For a space that is not the task's, or unknown.
+        DataError: For a space that is not the task's, or is unknown.
     """
     space, env = metadata["observation_space"], metadata["env_spec"]
     subtasks = (env or {"kwargs": {}})["kwargs"].get("tasks_to_complete", list(SUBTASKS))
     layout = task_layout(task) if task else find_layout(space, subtasks)
     if layout is None or not layout.fits(space):
-        needed = f"task '{task.name}' needs {layout}" if task else "no task has such a one"
-        found = one_line(space_in_words(space))
+        needed = f"task '{task.name}' needs {layout}" if task else "no task has such a space"
+        found = one_line(describe_space(space))
         raise DataError(f"data set '{metadata['dataset_id']}': its observation space is {found}, but {needed}")
     return layout
 
@@ -244,10 +244,10 @@ def action_box(metadata: dict[str, Any], task: Task | None) -> tuple[NDArray[np.
 
     Args:
         metadata: From `read_metadata`.
-        task: Whose box it must be; None takes any.
+        task: The task whose box it must be; None accepts any.
 
     Raises:
-        DataError: For anything but a bounded Box, and for one that is not the task's.
+        DataError: For anything but a bounded Box, and for a Box that is not the task's.
     """
     space, where = metadata["action_space"], f"data set '{metadata['dataset_id']}': its action space"
     shape = box_shape(space)
@@ -273,7 +273,7 @@ def action_box(metadata: dict[str, Any], task: Task | None) -> tuple[NDArray[np.
 
 
 def _short(value: Any) -> str:
-    """A value of the file, or an error over it, as part of a message."""
+    """A value of the file, or an error about it, as part of a message."""
     try:
         return one_line(f"{type(value).__name__}: {value}" if isinstance(value, Exception) else repr(value))
     except RecursionError:
@@ -281,6 +281,6 @@ def _short(value: Any) -> str:
 
 
 def one_line(text: str) -> str:
-    """Text of a file, cut to a line and without what a terminal would obey."""
+    """Text of a file, cut to one line and without control characters."""
     text = "".join(letter if letter.isprintable() else "?" for letter in text)
     return text if len(text) <= 120 else f"{text[:117]}..."

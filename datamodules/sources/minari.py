@@ -1,8 +1,8 @@
-"""Reads Minari data sets without trusting them: nothing in a data set is ever run.
+"""`local:DIR` and `minari:ID`: Minari data sets, read without trusting them; nothing in a data set is ever run.
 
-Minari's own loader builds environments from `metadata.json`, and with them whatever that file names. Here that
-file is judged first (`datamodules.sources.metadata`), and HDF5 is read directly, episode by episode, no more of
-it than the task's observations need.
+Minari's loader builds environments from `metadata.json`, and thereby runs whatever that file names. Here that file is
+checked first (`datamodules.sources.metadata`), and HDF5 is read directly, episode by episode, and only as much of it as
+the task's observations need.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,44 +18,45 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.sources.hdf5 import MAX_RATIO, SMALL, check_array, member, open_hdf5, read_rows
+from datamodules.sources.hdf5 import MAX_RATIO, SMALL, array_in, check_array, group_in, member, open_hdf5, read_rows
 from datamodules.sources.metadata import action_box, check_task, observation_layout, one_line, read_metadata
-from datamodules.sources.observations import Layout, Part
+from datamodules.sources.observations import Layout
+from datamodules.sources.source import Recording, Source
 from datamodules.trajectories import Trajectories
 from datamodules.validation import FIELDS, DataError, validate_episode
 from dds_lightning.errors import UserError
 from dds_lightning.saving.files import mend_folder
 from dds_lightning.tasks import Task
+from dds_lightning.tasks.bodies import Part
 
-Fields = dict[str, NDArray[Any]]
-
-
-def load_minari_id(dataset_id: str, task: Task | None) -> Trajectories:
-    """Read a data set of Minari's local store, by its id."""
-    return load_local(str(minari_folder(dataset_id)), task)
+Fields = dict[str, Any]
 
 
-def minari_env_id(dataset_id: str) -> str | None:
-    """The environment that a data set of Minari's local store was recorded in; None where it does not say."""
-    return local_env_id(str(minari_folder(dataset_id)))
-
-
-def local_env_id(directory: str) -> str | None:
-    """The same for a folder."""
+def local_env_id(directory: str | Path) -> str | None:
+    """The environment that the data set in a folder was recorded in; None where it does not say."""
     spec = read_metadata(data_folder(directory))["env_spec"]
     return None if spec is None else str(spec["id"])
+
+
+def check_minari_id(dataset_id: str) -> str:
+    """The id itself.
+
+    Raises:
+        UserError: For anything that is not an id, such as a path out of the store.
+    """
+    if not re.fullmatch(r"[\w-]+(/[\w-]+)*", dataset_id):
+        raise UserError(f"data: '{dataset_id}' is not a Minari id, expected one like pointmaze-large-diverse-v0")
+    return dataset_id
 
 
 def minari_folder(dataset_id: str) -> Path:
     """The folder of a data set in Minari's local store.
 
     Raises:
-        UserError: For what is no id, such as a path out of the store.
-        DataError: When it is not there.
+        UserError: For anything that is not an id.
+        DataError: When the data set does not exist.
     """
-    if not re.fullmatch(r"[\w-]+(/[\w-]+)*", dataset_id):
-        raise UserError(f"data: '{dataset_id}' is no Minari id; one is pointmaze-large-diverse-v0")
-    folder = minari_root() / dataset_id
+    folder = minari_root() / check_minari_id(dataset_id)
     if not folder.is_dir():
         raise DataError(
             f"data set '{dataset_id}' is not in {minari_root()}; collect it with `dds data collect`, "
@@ -68,14 +70,14 @@ def minari_root() -> Path:
     return Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets")
 
 
-def load_local(directory: str, task: Task | None) -> Trajectories:
+def load_local(directory: str | Path, task: Task | None) -> Trajectories:
     """Read the Minari data set in a folder (`DIR/data/main_data.hdf5` and `metadata.json`).
 
-    Memory holds the result and one episode, whatever the file stores beside them.
+    Memory is needed for the result and one episode, whatever else the file stores.
 
     Args:
         directory: The folder.
-        task: What the data must fit, from `resolve_task`; None takes any layout that is known.
+        task: What the data must fit, from `resolve_task`; None accepts every known layout.
 
     Raises:
         DataError: For anything missing, damaged, dangerous or of another task.
@@ -91,7 +93,7 @@ def load_local(directory: str, task: Task | None) -> Trajectories:
 
 
 def data_folder(directory: str | Path) -> Path:
-    """Where `main_data.hdf5` and `metadata.json` of a data set's folder lie: in `data`, or in itself."""
+    """The folder with `main_data.hdf5` and `metadata.json`: `data` in a data set's folder, or that folder itself."""
     folder = Path(directory).expanduser()
     with contextlib.suppress(OSError):
         mend_folder(folder)
@@ -104,7 +106,7 @@ class _Reader:
     Args:
         path: main_data.hdf5.
         name: Of the data set, for messages.
-        layout: How observations become flat.
+        layout: How observations are flattened.
         low: (A,) lower bounds of actions.
         high: (A,) upper bounds.
     """
@@ -120,29 +122,29 @@ class _Reader:
         """Every episode, checked by `validate_episode`.
 
         Args:
-            episodes: How many the metadata promise; None where they do not.
-            steps: Likewise.
+            episodes: Number that the metadata promise; None if they do not.
+            steps: Likewise, of all episodes.
 
         Returns:
             Lengths (E,), and the arrays of all episodes end to end, as in `Trajectories`.
         """
         with open_hdf5(self.path, f"data set '{self.name}'") as file:
-            names = set(file)  # asking the file whether it has a name would follow links
+            names = set(file)  # asking the file for a single name would follow links
             labels = [f"episode_{number}" for number in range(len(names))]
-            self._keep_promise("episodes", episodes, len(labels))
+            self._check_promise("episodes", episodes, len(labels))
             if not labels:
                 raise DataError(f"data set '{self.name}' is empty: it has no episodes")
             missing = next((label for label in labels if label not in names), None)
             if missing is not None:
                 raise DataError(f"data set '{self.name}': {self.path} has {len(labels)} episodes, but no {missing}")
             lengths = np.array([self._steps(file, label) for label in labels], np.int64)
-            self._keep_promise("steps", steps, int(lengths.sum()))
+            self._check_promise("steps", steps, int(lengths.sum()))
             return lengths, self._arrays(file, labels, lengths)
 
-    def _keep_promise(self, what: str, promised: int | None, found: int) -> None:
+    def _check_promise(self, what: str, promised: int | None, found: int) -> None:
         if promised is not None and found != promised:
             raise DataError(
-                f"data set '{self.name}': metadata.json promises {promised} {what}, but {self.path} holds {found}"
+                f"data set '{self.name}': metadata.json promises {promised} {what}, but {self.path} has {found}"
             )
 
     def _steps(self, file: h5py.File, label: str) -> int:
@@ -157,7 +159,7 @@ class _Reader:
         for number, label in enumerate(labels):
             fields = self._episode(file, label)
             if not arrays:
-                self.width = fields["observations"].shape[1]  # where no task said it, all have that of the first
+                self.width = fields["observations"].shape[1]  # without a task, all have the width of the first
                 arrays = self._empty(fields, int(lengths.sum()), len(labels))
             for key, one in fields.items():
                 first = step + (number if key == "observations" else 0)
@@ -166,9 +168,9 @@ class _Reader:
         return arrays
 
     def _empty(self, fields: Fields, steps: int, episodes: int) -> Fields:
-        """Room for all episodes; `fields` are those of one."""
+        """Empty arrays for all episodes; `fields` are those of one."""
         rows = {key: steps + (episodes if key == "observations" else 0) for key in fields}
-        self._believe(sum(rows[key] * one[:1].nbytes for key, one in fields.items()))
+        self._check_total(sum(rows[key] * one[:1].nbytes for key, one in fields.items()))
         return {key: np.empty((rows[key], *one.shape[1:]), one.dtype) for key, one in fields.items()}
 
     def _episode(self, file: h5py.File, label: str) -> Fields:
@@ -185,7 +187,7 @@ class _Reader:
         where = f"data set '{self.name}', {label}"
         group = member(file, label, f"data set '{self.name}'")
         if not isinstance(group, h5py.Group):
-            raise DataError(f"{where}: found an array, expected a group of {', '.join(FIELDS)}")
+            raise DataError(f"{where}: got an array, expected a group of {', '.join(FIELDS)}")
         found = list(group)
         missing = next((key for key in FIELDS if key not in found), None)
         if missing:
@@ -196,23 +198,23 @@ class _Reader:
         if not self.layout.parts:
             return self._array(node, where)
         if not isinstance(node, h5py.Group):
-            raise DataError(f"{where}: found an array, expected a group, for the observation space is {self.layout}")
+            raise DataError(f"{where}: got an array, expected a group, for the observation space is {self.layout}")
         arrays = {key: self._part(node, key, part, where) for key, part in self.layout.parts.items()}
         rows = {key: len(array) for key, array in arrays.items()}
         if len(set(rows.values())) > 1:
             found = " and ".join(f"{count} rows of {key}" for key, count in rows.items())
-            raise DataError(f"{where}: found {found}, expected the same number")
+            raise DataError(f"{where}: got {found}, expected the same number")
         return self.layout.flatten(arrays)
 
     def _part(self, group: h5py.Group, key: str, part: Part, where: str) -> NDArray[Any]:
         found = list(group)
         if key not in found:
-            raise DataError(f"{where}: found the entries {one_line(', '.join(found)) or 'none'}, expected '{key}'")
+            raise DataError(f"{where}: got the entries {one_line(', '.join(found)) or 'none'}, expected '{key}'")
         node, where = member(group, key, where), f"{where}/{key}"
         array = check_array(node, where)
         if len(array.shape) != 2 or array.shape[1] not in part.widths:
             expected = " or ".join(f"(steps, {width})" for width in part.widths)
-            raise DataError(f"{where}: found shape {array.shape}, expected {expected}")
+            raise DataError(f"{where}: got shape {array.shape}, expected {expected}")
         self._count(array.nbytes)
         return read_rows(array, where, 0, len(array), part.columns)
 
@@ -222,13 +224,109 @@ class _Reader:
         return read_rows(array, where, 0, len(array))
 
     def _count(self, size: int) -> None:
-        """Add up what is read: many episodes may share one array, or each be packed very small."""
+        """Add up what is read: many episodes may share one array, or each be highly compressed."""
         self.bytes += size
-        self._believe(self.bytes)
+        self._check_total(self.bytes)
 
-    def _believe(self, size: int) -> None:
+    def _check_total(self, size: int) -> None:
         if size > max(SMALL, MAX_RATIO * self.path.stat().st_size):
             raise DataError(
                 f"data set '{self.name}': the arrays of {self.path} are more than {MAX_RATIO} times as large as the "
-                "file, which is not believed"
+                "file, which is not plausible"
             )
+
+
+# ---------------------------------------------------------------------- single rows
+
+EPISODES = 100
+"""Episodes from which single rows are read: each costs a few look-ups in the file."""
+
+
+@contextlib.contextmanager
+def open_local(directory: str | Path, task: Task, rng: np.random.Generator) -> Iterator[Recording]:
+    """Open the Minari data set in a folder for reading single rows; see `Source.open_rows`."""
+    data = data_folder(directory)
+    metadata = read_metadata(data)
+    check_task(metadata, task)
+    with open_hdf5(data / "main_data.hdf5", f"data set '{metadata['dataset_id']}'") as file:
+        yield _MinariRows(file, metadata, task, rng)
+
+
+class _MinariRows:
+    """Some episodes, spread over the set, of a Minari data set."""
+
+    def __init__(self, file: h5py.File, metadata: dict[str, Any], task: Task, rng: np.random.Generator) -> None:
+        self.where = f"data set '{metadata['dataset_id']}'"
+        self.layout = observation_layout(metadata, task)
+        labels = sorted(file, key=lambda label: (len(label), label))
+        if not labels:
+            raise DataError(f"{self.where} is empty: it has no episodes")
+        chosen = np.sort(rng.choice(len(labels), min(EPISODES, len(labels)), replace=False))
+        self.episodes = [self._episode(file, labels[number]) for number in chosen]
+        self.steps = self.known = np.array([len(episode["rewards"]) for episode in self.episodes])
+        self.ended = np.array(
+            [
+                bool(read_rows(episode["terminations"], self.where, count - 1, count)[0])
+                for episode, count in zip(self.episodes, self.steps.tolist(), strict=True)
+            ]
+        )
+        self.width = self.states(0, 0, 1).shape[1]
+
+    def _episode(self, file: h5py.File, label: str) -> dict[str, h5py.Dataset]:
+        where = f"{self.where}, {label}"
+        group = group_in(file, label, self.where)
+        fields = {key: array_in(group, key, where) for key in ("actions", "rewards", "terminations")}
+        steps = len(fields["rewards"])
+        if not self.layout.parts:
+            fields["observations"] = array_in(group, "observations", where)
+        else:
+            inner = group_in(group, "observations", where)
+            seen = f"{where}, observations"
+            fields |= {f"observations/{key}": array_in(inner, key, seen) for key in self.layout.parts}
+        for key, field in fields.items():
+            is_state = key.startswith("observations")
+            if len(field) != steps + is_state or field.ndim != (2 if is_state or key == "actions" else 1) or not steps:
+                expected = f"{steps + is_state} rows, for rewards has {steps}"
+                raise DataError(f"{where}, {key}: got shape {field.shape}, expected {expected}")
+        return fields
+
+    def states(self, episode: int, start: int, stop: int) -> NDArray[Any]:
+        fields = self.episodes[episode]
+        keys = [key for key in fields if key.startswith("observations")]
+        widths: list[int | None] = [part.columns for part in self.layout.parts.values()] or [None]
+        # Here the kitchen keeps its velocities, which `Layout.flatten` leaves out.
+        parts = [
+            read_rows(fields[key], f"{self.where}, {key}", start, stop, width)
+            for key, width in zip(keys, widths, strict=True)
+        ]
+        return np.concatenate(parts, axis=1)
+
+    def taken(self, episode: int, start: int, stop: int) -> tuple[NDArray[Any], NDArray[Any]]:
+        fields = self.episodes[episode]
+        actions, rewards = (
+            read_rows(fields[key], f"{self.where}, {key}", start, stop) for key in ("actions", "rewards")
+        )
+        return actions, rewards
+
+    def inner(self, episode: int, step: int) -> None:
+        return None
+
+
+LOCAL = Source(
+    rest="DIR",
+    about="a folder with a Minari data set",
+    load=load_local,
+    locate=lambda directory: Path(directory).expanduser(),
+    open_rows=open_local,
+    recorded_in=local_env_id,
+)
+
+MINARI = Source(
+    rest="ID",
+    about="a data set in Minari's local store",
+    load=lambda dataset_id, task: load_local(minari_folder(dataset_id), task),
+    locate=lambda dataset_id: minari_root() / check_minari_id(dataset_id),
+    open_rows=lambda dataset_id, task, rng: open_local(minari_folder(dataset_id), task, rng),
+    recorded_in=lambda dataset_id: local_env_id(minari_folder(dataset_id)),
+)
+"""`local` under a folder that the id names."""

@@ -1,4 +1,4 @@
-"""From observations as environments record them to the flat ones of the task table: the one place that does.
+"""Converts observations as environments record them to the flat ones of the task table; no other file does.
 
 | layout | what is recorded at a step | flat observation |
 |---|---|---|
@@ -7,7 +7,7 @@
 | antmaze | Dict: `achieved_goal` (2,), `observation` (27,), in v5 (105,) with contact forces | both, 27 of the second |
 | kitchen | Dict: `observation` (59,) | positions of robot and objects (30), goal of the subtasks (30) |
 
-Goals that a recording had are left out: a task has one.
+The goals of a recording are left out: a task has only one.
 """
 
 from __future__ import annotations
@@ -20,36 +20,19 @@ from numpy.typing import NDArray
 
 from dds_lightning.envs.kitchen import goal_vector, kitchen_layout
 from dds_lightning.tasks import Task
+from dds_lightning.tasks.bodies import BODIES, Part, body_name
 
-
-class Part(NamedTuple):
-    """One array of a dictionary observation.
-
-    Attributes:
-        widths: That it may have.
-        columns: How many of them are read, from the first on.
-    """
-
-    widths: tuple[int, ...]
-    columns: int
-
-
-PARTS: dict[str, dict[str, Part]] = {
-    "flat": {},
-    "pointmaze": {"observation": Part((4,), 4)},
-    "antmaze": {"achieved_goal": Part((2,), 2), "observation": Part((27, 105), 27)},
-    "kitchen": {"observation": Part((59,), 59)},
-}
-"""Layout -> the arrays that are read of a dictionary; none where the observation is one array."""
+FLAT = "flat"
+"""Layout of observations that are one array."""
 
 
 class Layout(NamedTuple):
-    """How the observations of one recording become flat.
+    """How the observations of one recording are flattened.
 
     Attributes:
-        name: A key of `PARTS`.
-        width: O of flat observations; None takes any.
-        subtasks: In the kitchen, what the goal is.
+        name: `FLAT`, or a robot of `tasks.bodies`.
+        width: O of flat observations; None accepts any.
+        subtasks: In the kitchen, the subtasks of the goal.
     """
 
     name: str
@@ -57,12 +40,12 @@ class Layout(NamedTuple):
     subtasks: Sequence[str] = ()
 
     @property
-    def parts(self) -> dict[str, Part]:
-        """The arrays that are read of a dictionary; none where the observation is one array."""
-        return PARTS[self.name]
+    def parts(self) -> Mapping[str, Part]:
+        """The arrays that are read from a dictionary; none where the observation is one array."""
+        return {} if self.name == FLAT else BODIES[self.name].parts
 
     def fits(self, space: Mapping[str, Any]) -> bool:
-        """Whether observations of a space (Minari's JSON) have this layout."""
+        """Whether the observations of a space (Minari's JSON) have this layout."""
         if not self.parts:
             shape = box_shape(space) or ()
             return len(shape) == 1 and self.width in (None, *shape)
@@ -93,17 +76,18 @@ class Layout(NamedTuple):
 
 
 def task_layout(task: Task) -> Layout:
-    """How recordings of a task's environments look."""
-    return Layout("flat" if task.adapter == "flat" else task.family, task.observation_dim, task.subtasks)
+    """The layout of recordings of a task's environments."""
+    return Layout(FLAT if task.adapter == "flat" else body_name(task), task.observation_dim, task.subtasks)
 
 
 def find_layout(space: Mapping[str, Any], subtasks: Sequence[str]) -> Layout | None:
-    """The layout that a space has, where no task says it; None where it is none of ours."""
-    return next((layout for name in PARTS if (layout := Layout(name, subtasks=subtasks)).fits(space)), None)
+    """The layout of a space when the task is unknown; None if it is not one of ours."""
+    names = (FLAT, *(name for name, body in BODIES.items() if body.parts))
+    return next((layout for name in names if (layout := Layout(name, subtasks=subtasks)).fits(space)), None)
 
 
-def space_in_words(space: Mapping[str, Any]) -> str:
-    """A space in a few words, for messages."""
+def describe_space(space: Mapping[str, Any]) -> str:
+    """A short description of a space, for messages."""
     inner = _subspaces(space)
     if inner:
         return f"a Dict of {', '.join(f'{name} {_size(one)}' for name, one in list(inner.items())[:6])}"

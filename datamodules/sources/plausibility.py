@@ -1,4 +1,4 @@
-"""Tells by its numbers whether a recording can be of a task at all: D4RL's files do not say what they are of."""
+"""Checks by its numbers whether a recording can be of a task: D4RL's files do not name their environment."""
 
 from __future__ import annotations
 
@@ -8,25 +8,23 @@ from numpy.typing import NDArray
 from datamodules.validation import DataError
 from dds_lightning.envs.kitchen import goal_vector
 from dds_lightning.tasks import Task
+from dds_lightning.tasks.bodies import body_of
 
 IN_WALLS = 0.05
-"""Share of positions that may lie in walls: none do, but maps may be drawn with a margin."""
-
-HEIGHTS = {"walker2d": (0.8, 2.0), "halfcheetah": (-1.0, 0.8)}
-"""Heights of two bodies whose observations and actions have the same widths: a walker below 0.8 m has fallen."""
+"""Share of positions that may lie in walls. None do, but maps may be drawn with a margin."""
 
 SAMPLE = 100_000
-"""Rows that are looked at."""
+"""Rows that are inspected."""
 
 
 def refuse_other_task(where: str, observations: NDArray[np.float32], task: Task) -> None:
-    """Refuse observations that no recording of `task` can hold.
+    """Refuse observations that no recording of `task` can contain.
 
     Args:
         where: The data set, as messages begin.
-        observations: (N, O), the widths are right already.
-        task: In mazes positions must lie in its corridors, in the kitchen the goal columns must hold its
-            subtasks, and bodies of the same widths are told apart by their height.
+        observations: (N, O); their width has been checked.
+        task: In mazes, positions must lie in its corridors; in the kitchen, the goal columns must match its
+            subtasks; bodies with the same widths are distinguished by their height.
 
     Raises:
         DataError: For the data of another task.
@@ -34,13 +32,13 @@ def refuse_other_task(where: str, observations: NDArray[np.float32], task: Task)
     rows = observations[:: max(1, len(observations) // SAMPLE)]
     if task.maze_map is not None:
         _refuse_other_maze(where, rows, task)
-    if task.family == "kitchen":
+    if task.subtasks:
         _refuse_other_subtasks(where, rows, task)
-    low, high = HEIGHTS.get(task.base_name.partition("-")[0], (-np.inf, np.inf))
+    low, high = body_of(task).heights
     height = float(np.median(rows[:, 0]))
     if not low <= height <= high:
         raise DataError(
-            f"{where}, observations: the body's median height is {height:.3g} m, but in task '{task.name}' it lies "
+            f"{where}, observations: the body's median height is {height:.3g} m, but in task '{task.name}' it is "
             f"between {low:g} and {high:g}; the data are of another body"
         )
 
@@ -54,7 +52,7 @@ def _refuse_other_maze(where: str, rows: NDArray[np.float32], task: Task) -> Non
     if share > IN_WALLS:
         raise DataError(
             f"{where}, observations: {share:.0%} of the positions lie outside the corridors of task '{task.name}'; "
-            "the data are of another maze, or of another physics with other coordinates"
+            "the data are of another maze, or of other physics with other coordinates"
         )
 
 
@@ -64,6 +62,6 @@ def _refuse_other_subtasks(where: str, rows: NDArray[np.float32], task: Task) ->
     if len(odd):
         row, column = (int(index) for index in odd[0])
         raise DataError(
-            f"{where}, observations: found {rows[row, 30 + column]:g} in column {30 + column}, but the goal of task "
+            f"{where}, observations: got {rows[row, 30 + column]:g} in column {30 + column}, but the goal of task "
             f"'{task.name}' ({', '.join(task.subtasks)}) has {expected[column]:g} there; the data are of another task"
         )

@@ -1,16 +1,16 @@
-"""The kitchen's two rewards: how many subtasks are done, which is learnt, and +1 for each once, which is scored.
+"""The kitchen's two rewards: the number of subtasks done, which is learnt from, and +1 once for each, which is scored.
 
     state                    0   1   2   3   4   5
     microwave is open        .   .   x   x   x   x
-    kettle is on the burner  .   .   .   x   .   x      one that slides off is not done any more
+    kettle is on the burner  .   .   .   x   .   x      one that slides off is no longer done
     step                       0   1   2   3   4
-    done afterwards            0   1   2   1   2        `relabel_subtasks`: learnt
+    done afterwards            0   1   2   1   2        `relabel_subtasks`: learnt from
     done for the first time    0   1   1   0   0        `subtasks_completed` is their sum, 2: scored
 
-Which of the two a recording holds depends on who made it. gymnasium-robotics' environment gives the lower one, and
-the upper one with `remove_task_when_completed=False`, as in Minari's published sets. D4RL's files give each row
-the number done in its own state: the upper one, a step later. All of them follow from the states, so they are
-counted there, and every source of the same episode gives the same rewards.
+Which of the two a recording has depends on its origin. gymnasium-robotics' environment gives the lower one, and the
+upper one with `remove_task_when_completed=False`, as in Minari's published sets. D4RL's files give each row the number
+done in that row's state: the upper one, a step later. All of them follow from the states, so they are counted there,
+and every source of the same episode gives the same rewards.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ def relabel_subtasks(trajectories: Trajectories, task: Task) -> Trajectories:
     Terminations stay: recordings of people go on, or end, when everything is done.
 
     Args:
-        trajectories: Of the kitchen; recorded rewards are not looked at.
-        task: Whose M subtasks count.
+        trajectories: Data of the kitchen; recorded rewards are ignored.
+        task: The task whose M subtasks count.
     """
     return replace(trajectories, rewards=_done(trajectories, task).sum(axis=1).astype(np.float32))
 

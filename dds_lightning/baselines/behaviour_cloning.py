@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 import torch
@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dds_lightning.errors import UserError
-from dds_lightning.finetune import refuse_other_box
 from dds_lightning.module import StageModule, is_log_step
 from dds_lightning.nn.mlp import MLP
 from dds_lightning.nn.normaliser import ActionBox, Normaliser
+from dds_lightning.rollout.actors import Acted
 from dds_lightning.tasks import Task
 
 
@@ -86,18 +86,7 @@ class BehaviourCloning(StageModule):
 
     def on_fit_start(self) -> None:
         """Take the data's statistics, unless a checkpoint brought them."""
-        datamodule: Any = getattr(self.trainer, "datamodule", None)
-        if bool(self.normaliser.fitted):
-            refuse_other_box(self, datamodule)
-            return
-        if datamodule is None or not hasattr(datamodule, "statistics"):
-            raise UserError(
-                "the clone has no observation statistics: fit it with a SegmentDataModule, or call "
-                "normaliser.fit(mean, std) and action_box.fit(low, high) first"
-            )
-        statistics = datamodule.statistics()
-        self.normaliser.fit(statistics["observation_mean"], statistics["observation_std"])
-        self.action_box.fit(statistics["action_low"], statistics["action_high"])
+        self.fit_units()
 
     def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """One optimiser step's loss."""
@@ -106,13 +95,9 @@ class BehaviourCloning(StageModule):
             self.log("train/loss", loss.detach())
         return loss
 
-    def validation_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
-        """The same loss on held-out episodes."""
-        self.log("val/loss", self.loss(batch), prog_bar=True, batch_size=len(batch["actions"]))
-
-    def test_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
-        """As `validation_step`."""
-        self.log("test/loss", self.loss(batch), batch_size=len(batch["actions"]))
+    def evaluate(self, batch: dict[str, Tensor], stage: str) -> None:
+        """Log the same loss on held-out episodes."""
+        self.log(f"{stage}/loss", self.loss(batch), prog_bar=stage == "val", batch_size=len(batch["actions"]))
 
     def predict_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """Actions (B H, A) for the steps of a batch."""
@@ -147,10 +132,10 @@ class CloneActor:
         observations: NDArray[np.float32],
         restarted: NDArray[np.bool_] | None = None,
         rows: NDArray[np.intp] | None = None,
-    ) -> NDArray[np.float32]:
+    ) -> Acted:
         """Actions (n, A) for observations (n, O); see `dds_lightning.rollout.actors.Actor.act`."""
         x = torch.from_numpy(np.ascontiguousarray(observations, dtype=np.float32)).to(self.module.device)
-        return self.module(x).float().cpu().numpy()
+        return Acted(self.module(x).float().cpu().numpy())
 
 
 def fit_clone(

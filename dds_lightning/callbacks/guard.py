@@ -13,12 +13,12 @@ from dds_lightning.errors import UserError
 class FiniteGuard(Callback):
     """Refuse a loss that is NaN or infinite before the backward pass: the weights and the last checkpoint stay good.
 
-    On a CPU every step is looked at, which costs nothing. On an accelerator a look waits for the device, so only every
-    ``every_n_steps``-th step is looked at in words; the steps between are watched by an assertion on the device itself,
-    which stops the program as well, but cannot name the term.
+    On a CPU every step is checked, which costs nothing. On an accelerator a check waits for the device, so only every
+    ``every_n_steps``-th step gets a message; the steps between are checked by an assertion on the device, which stops
+    the program as well, but cannot name the term.
 
     Args:
-        every_n_steps: steps between two looks on an accelerator.
+        every_n_steps: Steps between two checks on an accelerator.
     """
 
     def __init__(self, every_n_steps: int = 50) -> None:
@@ -27,10 +27,10 @@ class FiniteGuard(Callback):
         self.every_n_steps = every_n_steps
 
     def on_before_backward(self, trainer: pl.Trainer, pl_module: pl.LightningModule, loss: Tensor) -> None:
-        """Look at the loss of this step.
+        """Check the loss of this step.
 
         Raises:
-            UserError: the loss is not finite; the message names the terms that are not.
+            UserError: The loss is not finite; the message names the terms that are not.
         """
         if loss.is_cuda and trainer.global_step % self.every_n_steps:
             torch._assert_async(torch.isfinite(loss).all())

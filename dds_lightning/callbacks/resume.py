@@ -1,4 +1,4 @@
-"""Resume exactly: Lightning saves no state of the random streams, so this callback does."""
+"""Exact resuming: Lightning does not save the state of the random streams, so this callback does."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ def set_rng_state(state: dict[str, Any]) -> None:
     torch.set_rng_state(state["torch"].cpu())
     cuda = state["cuda"]
     if len(cuda) == torch.cuda.device_count():
-        torch.cuda.set_rng_state_all([own.cpu() for own in cuda])
+        torch.cuda.set_rng_state_all([stream.cpu() for stream in cuda])
     elif cuda:
         warnings.warn(
             f"the checkpoint has random streams of {len(cuda)} GPUs, here are {torch.cuda.device_count()}: "
-            "training goes on, but not bit for bit as it would have",
+            "training continues, but not bit for bit as it would have",
             stacklevel=2,
         )
     name, keys, position, has_gauss, cached = state["numpy"]
@@ -55,7 +55,7 @@ def set_rng_state(state: dict[str, Any]) -> None:
 
 @contextlib.contextmanager
 def undisturbed(*modules: torch.nn.Module) -> Iterator[None]:
-    """Put back the global random streams and each module's train or eval mode, whatever happens inside."""
+    """Restore the global random streams and each module's train or eval mode afterwards."""
     state = rng_state()
     modes = [(part, part.training) for module in modules for part in module.modules()]
     try:
@@ -67,9 +67,9 @@ def undisturbed(*modules: torch.nn.Module) -> Iterator[None]:
 
 
 class ExactResume(Callback):
-    """Keep the random streams in every checkpoint and put them back where training goes on.
+    """Save the random streams in every checkpoint and restore them when training continues.
 
-    With a loader that saves its own place (`TensorLoader`), a run that was stopped after any step and resumed
+    With a loader that saves its position (`TensorLoader`), a run that was stopped after any step and resumed
     in a new process ends with the same bits as one that never stopped, on a CPU.
 
     The streams are also put back after each validation. When a checkpoint was written at a step that is
@@ -78,7 +78,7 @@ class ExactResume(Callback):
     """
 
     def __init__(self) -> None:
-        """Nothing to restore yet."""
+        """Start without anything to restore."""
         self._states: list[dict[str, Any]] | None = None
         self._before_validation: dict[str, Any] | None = None
 
@@ -95,29 +95,29 @@ class ExactResume(Callback):
     def on_load_checkpoint(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Keep the streams until training starts: what runs before must not use them up."""
+        """Keep the streams until training starts: what runs before must not advance them."""
         self._states = checkpoint.get("rng")
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Put the streams back."""
+        """Restore the streams."""
         states, self._states = self._states, None
         if states is None:
             return
         if len(states) != trainer.world_size:
             warnings.warn(
                 f"the checkpoint was made by {len(states)} processes, {trainer.world_size} resume it: "
-                "training goes on, but not bit for bit as it would have",
+                "training continues, but not bit for bit as it would have",
                 stacklevel=2,
             )
             return
         set_rng_state(states[trainer.global_rank])
 
     def on_validation_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Remember where training was."""
+        """Save the streams of the training."""
         self._before_validation = rng_state()
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Let training go on from there."""
+        """Restore the streams of the training."""
         if self._before_validation is not None:
             set_rng_state(self._before_validation)
             self._before_validation = None

@@ -1,4 +1,8 @@
-"""One checkpoint from which a training goes on exactly where it stood."""
+"""One checkpoint from which a training continues exactly where it stopped.
+
+Lightning's `ModelCheckpoint` does not serve here: it does not save when a signal asks to stop, and where it saves
+before a validation of the same step, resuming leaves that validation out.
+"""
 
 import time
 from pathlib import Path
@@ -12,7 +16,7 @@ from dds_lightning.errors import UserError
 
 
 class RollingCheckpoint(Checkpoint):
-    """Keep one file, `last.ckpt`, from which training goes on exactly where it stood.
+    """Keep one file, `last.ckpt`, from which training continues exactly.
 
     It is written after an optimiser step whenever `every_n_steps` steps or `every_n_seconds` seconds have
     passed, at the end, and when SIGTERM or Ctrl-C asks to stop. What follows that step, its metrics and a validation
@@ -20,9 +24,9 @@ class RollingCheckpoint(Checkpoint):
     replace the last good one.
 
     Args:
-        dirpath: folder of the file; null puts it beside the logs of this launch.
-        every_n_seconds: seconds between two writes; 0 for none by time.
-        every_n_steps: steps between two writes; 0 for none by steps.
+        dirpath: Folder of the file; null puts it beside the logs of this launch.
+        every_n_seconds: Seconds between two writes; 0 ignores time.
+        every_n_steps: Steps between two writes; 0 ignores steps.
     """
 
     def __init__(self, dirpath: str | None = None, every_n_seconds: float = 60.0, every_n_steps: int = 0) -> None:
@@ -39,14 +43,14 @@ class RollingCheckpoint(Checkpoint):
         self._unflushed = self._leaving = False
 
     def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
-        """Settle where the file goes."""
+        """Decide where the file goes."""
         if stage == "fit":
             folder = self.dirpath or str(Path(trainer.log_dir or trainer.default_root_dir) / "checkpoints")
             self.path = Path(trainer.strategy.broadcast(folder)) / "last.ckpt"
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Count the seconds from here: what lies before cannot be lost."""
-        # Lightning's own SIGTERM handler ends the program between two steps, and nothing is saved.
+        """Count the seconds from here: nothing before can be lost."""
+        # Lightning's SIGTERM handler would end the program between two steps without saving.
         interrupts.take_back()
         self._saved_time = time.monotonic()
         self._saved_step = trainer.global_step
@@ -54,9 +58,9 @@ class RollingCheckpoint(Checkpoint):
     def on_train_batch_start(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, batch: Any, batch_idx: int
     ) -> None:
-        """Everything that belongs to the step before is logged now: stop here if somebody asked to."""
+        """Stop here if a signal asked to: everything that belongs to the previous step has been logged."""
         if self._unflushed:
-            # A kill must not cost metrics of steps that are saved: nobody would do these steps again.
+            # A kill must not lose metrics of steps that are saved, because these steps are not repeated.
             for logger in trainer.loggers:
                 logger.save()
             self._unflushed = False
@@ -65,7 +69,7 @@ class RollingCheckpoint(Checkpoint):
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Save when it is time, or when somebody asked to stop."""
+        """Save when it is due, or when a signal asked to stop."""
         step = trainer.global_step
         by_time = self.every_n_seconds > 0 and time.monotonic() - self._saved_time >= self.every_n_seconds
         if trainer.world_size > 1:
@@ -88,11 +92,11 @@ class RollingCheckpoint(Checkpoint):
         self._leave()
 
     def state_dict(self) -> dict[str, Any]:
-        """The last value of every metric: a training that goes on may end before it measures some of them again."""
+        """The last value of every metric: a resumed training may end before it measures some of them again."""
         return {"metrics": self.metrics}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on from `state_dict`."""
+        """Restore what `state_dict` returned."""
         self.metrics = state_dict.get("metrics", {})
 
     def latest(self, trainer: pl.Trainer) -> dict[str, float]:
@@ -102,7 +106,7 @@ class RollingCheckpoint(Checkpoint):
     def _asked_to_stop(self, trainer: pl.Trainer) -> bool:
         asked = interrupts.pending() is not None
         if trainer.world_size > 1:
-            asked = trainer.strategy.reduce_boolean_decision(asked, all=False)  # not all may have got the signal
+            asked = trainer.strategy.reduce_boolean_decision(asked, all=False)  # some may not have received the signal
         self._leaving = self._leaving or asked
         return asked
 

@@ -28,7 +28,7 @@ class RolloutEvaluation(Callback):
     Logged for the first way of choosing skills: `rollout/score` (normalised, 0 to 100), `rollout/length` (steps)
     and, where the task measures it, `rollout/success` (per cent of the episodes); for each further way the
     same under `rollout/<selection>/`. While skills are trained the way is `random` skills, and
-    `rollout/best_skill_score` and `rollout/best_skill_success` tell of the best single skill alone.
+    `rollout/best_skill_score` and `rollout/best_skill_success` are those of the best single skill alone.
 
     The values are there before a `ModelCheckpoint` looks, so `monitor: rollout/score` keeps the best of any task
     (what was chosen by playing in the test environment is an optimistic figure: report the last as well).
@@ -40,26 +40,26 @@ class RolloutEvaluation(Callback):
     | `every_n_steps`       | after the optimiser step; no       | `ModelCheckpoint` with                   |
     |                       | validation is needed               | `every_n_train_steps` a multiple of it   |
 
-    Every evaluation starts from the same seeds. The agent draws from its own stream, the global random
-    streams and every module's mode are put back, and the environments live in other processes: training ends
+    Every evaluation starts from the same seeds. The agent has its own random stream, the global
+    streams and every module's mode are restored, and the environments live in other processes: training ends
     with the same bits as without this callback.
 
     Args:
-        task: name of the task (`dds tasks`); null takes the data module's.
-        episodes: for each way of choosing skills.
-        every_n_steps: optimiser steps between two evaluations; null evaluates at validations.
-        every_n_validations: validations between two evaluations, the first one included.
-        selections: ways of choosing skills while a policy is trained, the one to monitor first.
-        temperature: of `sample`.
-        noise_scale: factor on the decoder's noise; null takes the skill model's own.
-        skill: skill checkpoint for a policy; null takes the data module's.
-        episodes_per_skill: episodes of each single skill while skills are trained; 0 leaves them out.
-        seed: of environments and agent.
-        slots: environments.
-        workers: processes; null one a core.
+        task: Name of the task (`dds tasks`); null takes the data module's.
+        episodes: Episodes for each way of choosing skills.
+        every_n_steps: Optimiser steps between two evaluations; null evaluates at validations.
+        every_n_validations: Validations between two evaluations, the first one included.
+        selections: Ways of choosing skills while a policy is trained, the one to monitor first.
+        temperature: Temperature of `sample`.
+        noise_scale: Factor on the decoder's noise; null takes the skill model's setting.
+        skill: Skill checkpoint for a policy; null takes the data module's.
+        episodes_per_skill: Episodes of each single skill while skills are trained; 0 leaves them out.
+        seed: Seed of environments and agent.
+        slots: Number of environments.
+        workers: Number of processes; null for one per core.
 
     Raises:
-        UserError: a setting outside its range, or a `ModelCheckpoint` that would look at stale values.
+        UserError: A setting is outside its range, or a `ModelCheckpoint` would read stale values.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class RolloutEvaluation(Callback):
         slots: int = 64,
         workers: int | None = None,
     ) -> None:
-        """Check the settings; environments are made at the first evaluation."""
+        """Check the settings; environments are created at the first evaluation."""
         for name, value, least in (
             ("episodes", episodes, 1),
             ("every_n_steps", 1 if every_n_steps is None else every_n_steps, 1),
@@ -104,7 +104,7 @@ class RolloutEvaluation(Callback):
     # ---------------------------------------------------------------- when
 
     def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
-        """Find the task, and refuse checkpoints that would look at other moments than these."""
+        """Find the task, and refuse checkpoints that would read the metric at other steps."""
         self.task = self.task or getattr(getattr(trainer, "datamodule", None), "task", None)
         if self.task is None:
             raise UserError("rollout evaluation: task is missing; give the name of a task (`dds tasks` lists them)")
@@ -145,7 +145,7 @@ class RolloutEvaluation(Callback):
     # ---------------------------------------------------------------- what
 
     def contestants(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> list[Contestant]:
-        """Who plays; override it to evaluate a module of your own.
+        """Return who plays; override it to evaluate another module.
 
         The first contestant's values are logged as `rollout/score` and so on, those of further ones under their
         name.
@@ -172,14 +172,14 @@ class RolloutEvaluation(Callback):
             if self.skill_path is not None:
                 self._skill = SkillModule.load(self.skill_path)
             else:
-                found = getattr(getattr(trainer, "datamodule", None), "skill", None)
-                if not isinstance(found, SkillModule):
+                skill = getattr(getattr(trainer, "datamodule", None), "skill", None)
+                if not isinstance(skill, SkillModule):
                     raise UserError("rollout evaluation: skill is missing; give the skill checkpoint")
-                self._skill = copy.deepcopy(found)  # the data module goes on using its own, where it is
+                self._skill = copy.deepcopy(skill)  # the data module keeps using its own
         return self._skill.to(pl_module.device)
 
     def _evaluate(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> dict[str, float]:
-        """Play on the first process, and tell all."""
+        """Play on the first process, and send the values to all."""
         values: dict[str, float] = {}
         with undisturbed(pl_module):
             if trainer.is_global_zero:
@@ -201,8 +201,8 @@ class RolloutEvaluation(Callback):
         for rank, row in enumerate(result.summary().to_dict("records")):
             name = str(row["actor"])
             if name == "best_skill":
-                own = RolloutResult(result.task, result.episodes[result.episodes["actor"] == name])
-                alone = own.summary("label")
+                singles = RolloutResult(result.task, result.episodes[result.episodes["actor"] == name])
+                alone = singles.summary("label")
                 values |= {f"rollout/best_skill_{key}": float(alone[key].max()) for key in measured}
                 continue
             prefix = "rollout" if rank == 0 else f"rollout/{name}"
@@ -212,11 +212,11 @@ class RolloutEvaluation(Callback):
     # ---------------------------------------------------------------- state and end
 
     def state_dict(self) -> dict[str, Any]:
-        """What a resumed run needs to evaluate at the same moments, and the values so far."""
+        """What a resumed run needs to evaluate at the same steps, and the values so far."""
         return {"validations": self._validations, "step": self._evaluated_step, "history": list(self.history)}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on from `state_dict`."""
+        """Restore what `state_dict` returned."""
         self._validations, self._evaluated_step = state_dict["validations"], state_dict["step"]
         self.history = list(state_dict["history"])
 

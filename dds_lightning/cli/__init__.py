@@ -28,7 +28,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status: 0, 2 for what the user can mend, 128 + signal when interrupted.
 
     Args:
-        argv: the words after `dds`; None takes them from the process.
+        argv: The words after `dds`; None takes them from the process.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     try:

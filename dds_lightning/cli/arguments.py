@@ -1,4 +1,4 @@
-"""What several commands take and how it is read."""
+"""Arguments that several commands share, and how they are read."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ def data_spec(data: str) -> str:
         data: `SOURCE:NAME`, or a path: a folder of arrays, a Minari folder, or an HDF5 file in D4RL's layout.
 
     Raises:
-        UserError: there is no source and no such path.
+        UserError: There is no source and no such path.
     """
     path = Path(data).expanduser()
     if path.is_dir():

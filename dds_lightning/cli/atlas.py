@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from dds_lightning.cli.arguments import data_spec
@@ -60,9 +58,10 @@ def atlas(
         raise UserError(f"there is no {place}: give a run of `dds run`, a published directory or a skill checkpoint")
     spec = data_spec(data) if data else None
 
+    from dds_lightning.console.progress import announcements
     from dds_lightning.study.subject import atlas as make
 
-    with _progress(STAGES + len(against)) as tell:
+    with announcements(STAGES + len(against)) as tell:
         others, folder = [Path(one) for one in against], Path(figures) if figures else None
         made, path = make(root, spec, task, page, episodes, others, seed, folder, tell)
     found, trip, shown = made.recovery, made.trip, made.table[[name for name in SHOWN if name in made.table]]
@@ -78,23 +77,3 @@ def atlas(
         ("page", f"{path} ({path.stat().st_size / 1e6:.1f} MB)"),
     ]
     return Report({"atlas": path, **made.facts()}, [table(shown), pairs(lines)])
-
-
-@contextlib.contextmanager
-def _progress(total: int) -> Iterator[Callable[[str], None]]:
-    """A bar on standard error that is told in words what is being done; lines where that is no terminal."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
-    notebook = Console().is_jupyter  # no terminal, whatever its streams say: plain lines are what it can show
-    console = Console(stderr=True, force_jupyter=False, force_terminal=False if notebook else None)
-    columns = (SpinnerColumn(), BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        line = bar.add_task("atlas", total=total)
-
-        def tell(words: str) -> None:
-            bar.update(line, advance=1, description=words)
-            if not console.is_terminal:
-                console.print(words, highlight=False)
-
-        yield tell

@@ -18,7 +18,7 @@ def publish(
     card: str | None = None,
     public: bool = False,
 ) -> Report:
-    """Make a directory of an agent that others can load and trust, or push it to the Hugging Face hub.
+    """Make a directory of an agent that others can load and trust, or push it to the Hugging Face Hub.
 
     The directory holds the weights (safetensors), settings, scores, a card (a run's says which stage loses) and the
     hashes of all files; nothing in it is ever run. It is verified before it takes its place.
@@ -30,7 +30,7 @@ def publish(
         policy: policy checkpoint (.ckpt) to go with it
         task: name of the task to keep with it; without it the run's
         card: a text file for README.md; without it the run's own card
-        public: let everybody see a new repository on the hub
+        public: make a new repository on the Hub public
     """
     from dds_lightning.agent import DDSAgent
     from dds_lightning.saving.hub import is_hub, push
@@ -38,27 +38,27 @@ def publish(
     from dds_lightning.sharing.verify import verify_published
     from dds_lightning.study.card import with_diagnosis
     from dds_lightning.study.contestants import agent_directory
-    from dds_lightning.tasks import get_task
+    from dds_lightning.tasks import facts_to_keep, get_task, restore_task
 
     if (run == "-") != (skill is not None):
         raise UserError(f"run is '{run}' and --skill is {skill}: give a run, or - and --skill CHECKPOINT")
     if policy is not None and skill is None:
         raise UserError(f"--policy is {policy} without --skill: give both")
-    if task is not None:
-        get_task(task)
+    chosen = None if task is None else get_task(task)
     text = None if card is None else _text(card)
     if skill is not None:
         from dds_lightning.policy import PolicyModule
         from dds_lightning.skill import SkillModule
 
-        decides = None if policy is None else PolicyModule.load(policy)
-        agent = DDSAgent(SkillModule.load(skill), decides, "random" if decides is None else "sample")
-        about, metrics = {"task": task}, None
+        chooser = None if policy is None else PolicyModule.load(policy)
+        agent = DDSAgent(SkillModule.load(skill), chooser, "random" if chooser is None else "sample")
+        about, metrics = {"task": None} if chosen is None else facts_to_keep(chosen), None
     else:
         source = agent_directory(Path(run))
         published = load_published(source)
         agent = DDSAgent.load(source)
-        about, metrics = {"task": task or published.config.get("task")}, dict(published.metrics)
+        chosen = chosen or restore_task(published.config, source)
+        about, metrics = {"task": None} if chosen is None else facts_to_keep(chosen), dict(published.metrics)
         if text is None:
             text = (source / CARD).read_text(encoding="utf-8")
             if (Path(run) / "report").is_dir():
@@ -67,8 +67,8 @@ def publish(
         import tempfile
 
         with tempfile.TemporaryDirectory() as folder:
-            made = agent.save(Path(folder) / "agent", metrics=metrics, card=text, **about)
-            facts = {**verify_published(made), "directory": push(made, place, private=not public)}
+            saved = agent.save(Path(folder) / "agent", metrics=metrics, card=text, **about)
+            facts = {**verify_published(saved), "directory": push(saved, place, private=not public)}
     else:
         facts = verify_published(agent.save(place, metrics=metrics, card=text, **about))
     return Report(facts, [pairs(facts.items()), f'load it with DDSAgent.load("{place}")'])
@@ -89,9 +89,9 @@ def list_(root: list[str] = ["checkpoints", "runs"]) -> Report:  # noqa: B006 - 
 
 
 def verify(directory: str) -> Report:
-    """Look at everything in a published directory: hashes, header, shapes, finite numbers, known answers.
+    """Check everything in a published directory: hashes, header, shapes, finite numbers, known answers.
 
-    Ends with status 2 and what is wrong if it is not sound.
+    Ends with status 2, saying what is wrong, if it is not sound.
 
     Args:
         directory: as published, or hf:OWNER/NAME
@@ -100,7 +100,7 @@ def verify(directory: str) -> Report:
     from dds_lightning.sharing.verify import verify_published
 
     facts = verify_published(pull(directory) if is_hub(directory) else directory)
-    return Report(facts, [f"{directory} is sound: {_words(facts)}"])
+    return Report(facts, [f"{directory} is sound: {_summary(facts)}"])
 
 
 def export(
@@ -148,10 +148,11 @@ def export(
     return Report(data, [pairs({**facts, **describe(agent, task), **times}.items())])
 
 
-def _words(fact: dict[str, Any]) -> str:
+def _summary(fact: dict[str, Any]) -> str:
     golden = fact["golden"]
     answers = "it stores no answers to compare" if golden is None else f"answers as published (within {golden:.1g})"
-    return f"task {fact['task']}, {fact['parameters']:,} parameters, {fact['num_skills']} skills; {answers}"
+    holds = f"{fact['num_skills']} skills" if fact["num_skills"] else f"a {' and a '.join(fact['stages'])} model"
+    return f"task {fact['task']}, {fact['parameters']:,} parameters, {holds}; {answers}"
 
 
 def _text(card: str) -> str:

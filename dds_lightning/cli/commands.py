@@ -4,8 +4,9 @@ Heavy imports stay inside the functions, so that `dds tasks` need not wait for t
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+from datamodules.relabelling import Relabelling
 from dds_lightning.cli.arguments import data_spec
 from dds_lightning.console.reports import Report, pairs, table
 from dds_lightning.errors import UserError
@@ -49,7 +50,7 @@ def run(
     measured is null.
 
     Args:
-        task: name of a task; `dds tasks` lists them
+        task: name of a task (`dds tasks` lists them), a task file of your own (.yaml), or package.module:NAME
         out: folder of the run; without it runs/TASK
         data: your data, local:DIR, minari:ID, d4rl:FILE or arrays:DIR; without it data are collected in the environment
         seed: of everything random: data, both trainings and the evaluation
@@ -71,11 +72,12 @@ def run(
         **stages: settings for `dds STAGE fit` of each training stage, see above
     """
     from dds_lightning.pipeline.run import RunSettings, run_all
+    from dds_lightning.tasks import get_task
 
     return run_all(
         RunSettings.with_preset(
             task=task,
-            out=Path(out or f"runs/{task}"),
+            out=Path(out or f"runs/{get_task(task).name}"),
             data=data_spec(data) if data else None,
             seed=seed,
             preset=preset,
@@ -100,38 +102,22 @@ def relabel(
     data: str,
     task: str | None = None,
     out: str | None = None,
-    gamma: float = 0.99,
-    discount: Literal["per_skill", "per_step"] = "per_skill",
-    stride: int = 1,
-    reward_scale: float | None = None,
-    reward_shift: float | None = None,
+    **relabelling: Any,
 ) -> Report:
-    """Turn a data set into transitions between skills, and show how its codes are used.
+    """Turn a data set into transitions between skills, and show how the codes are used.
 
     Args:
         skill: skill checkpoint, a .ckpt file or a published directory
         data: local:DIR, minari:ID, d4rl:FILE, arrays:DIR, or just a folder or file
         task: name of the task; it decides how rewards are read
         out: file to write; without it the cache beside the checkpoint, where `dds policy fit` looks
-        gamma: discount a step inside a skill
-        discount: bootstrap with gamma (per_skill, the paper) or with gamma^steps (per_step)
-        stride: steps between the starts of two segments
-        reward_scale: factor on the learning reward; without it the task's
-        reward_shift: shift of the learning reward; without it the task's
+        **relabelling: fields of `datamodules.relabelling.Relabelling`
     """
     from datamodules.relabel import Relabelled
     from datamodules.relabelled import RelabeledDataModule
 
-    module = RelabeledDataModule(
-        task,
-        data_spec(data),
-        skill,
-        gamma=gamma,
-        discount=discount,
-        stride=stride,
-        reward_scale=reward_scale,
-        reward_shift=reward_shift,
-    )
+    settings = Relabelling(**relabelling).settings()
+    module = RelabeledDataModule(task, data_spec(data), skill, **settings)
     path = Path(out) if out else module.cache_file()
     try:
         made = Relabelled.load(path, module.key)  # done before

@@ -21,10 +21,10 @@ FIGURES = (".png", ".pdf", ".svg")
 
 
 def list_(root: list[str] = ["data"]) -> Report:  # noqa: B006 - jsonargparse shows the default
-    """List data sets, with the task that each fits: in Minari's folder, in D4RL's and in folders of your own.
+    """List data sets and the tasks that they fit: in Minari's folder, in D4RL's and in your own folders.
 
     Args:
-        root: folders to look in beside MINARI_DATASETS_PATH (or ~/.minari/datasets) and D4RL_DATASET_DIR (or
+        root: folders to search besides MINARI_DATASETS_PATH (or ~/.minari/datasets) and D4RL_DATASET_DIR (or
             ~/.d4rl/datasets)
     """
     from datamodules.listing import find_datasets
@@ -45,28 +45,28 @@ def show(
     out: str | None = None,
     no_figure: bool = False,
 ) -> Report:
-    """Show what is in a data set: facts, dimensions, longest episodes, and a figure of it all.
+    """Show what is in a data set: facts, dimensions, longest episodes, and a figure.
 
-    The figure has the lengths of the episodes, their returns, the actions and, with a maze task, the places
+    The figure shows the lengths of the episodes, their returns, the actions and, with a maze task, the places
     that were visited.
 
     Args:
         data: local:DIR, minari:ID, d4rl:FILE, arrays:DIR, or just a folder or file
-        task: name of the task; with it numbers have names, mazes walls, and rewards are those of its goal
-        episodes: rows of the table of episodes
+        task: name of the task; with it dimensions have names, mazes have walls, and rewards are those of its goal
+        episodes: number of rows in the table of episodes
         out: file of the figure (.png, .pdf or .svg); without it show/NAME.png in the current folder
         no_figure: print the tables only
     """
     from datamodules.inspection import describe, episode_table
-    from datamodules.sources import load_trajectories, resolve_task
+    from datamodules.sources import load_trajectories
 
     spec = data_spec(data)
     if episodes < 0:
         raise UserError(f"--episodes is {episodes}, expected at least 0")
     if out is not None and Path(out).suffix not in FIGURES:
         raise UserError(f"--out is {out}, expected a name that ends in {', '.join(FIGURES)}")
-    chosen = resolve_task(spec, task) if task else None
-    trajectories = load_trajectories(spec, chosen)
+    trajectories = load_trajectories(spec, task or None)
+    chosen = trajectories.task
     facts, dimensions = describe(trajectories, task=chosen)
     rows = episode_table(trajectories).sort_values("steps", ascending=False, kind="stable").head(episodes)
     report = Report(
@@ -94,12 +94,12 @@ def show(
 
 
 def fetch(task: str, source: Literal["d4rl", "minari"] = "d4rl", out: str | None = None) -> Report:
-    """Download a task's published data set; call it again after an interruption and it goes on.
+    """Download a task's published data set; repeat the command after an interruption to continue.
 
     Args:
         task: name of a task; `dds tasks NAME` says which data each source has for it
         source: d4rl (the data behind the paper's scores) or minari
-        out: folder to put it in; without it the source's own
+        out: folder for it; without it the source's own
     """
     from datamodules.sources.fetch import fetch as fetch_data
 
@@ -120,9 +120,9 @@ def collect(
     overwrite: bool = False,
     recipe: dict[str, bool | int | float] | None = None,
 ) -> Report:
-    """Make a data set by driving the task's environment, on all cores.
+    """Collect a data set in the task's environment, on all cores.
 
-    Call it again after an interruption and it goes on where it stopped.
+    Repeat the command after an interruption to continue where it stopped.
 
     Args:
         task: name of a task; `dds tasks` lists them
@@ -131,8 +131,8 @@ def collect(
         out: folder of data sets; the new one is a folder in it
         workers: processes; without it one for every core
         overwrite: replace a data set of the same name
-        recipe: what the behaviour does, one flag a setting, such as --recipe.action_noise=0.1 or, for AntMaze,
-            --recipe.end_when_flipped=true; a name that is not known is answered with those that are
+        recipe: what the behaviour does, one flag per setting, such as --recipe.action_noise=0.1 or, for AntMaze,
+            --recipe.end_when_flipped=true; an unknown name is answered with the known ones
     """
     from datamodules.collect.collectors import collect as collect_data
 
@@ -147,7 +147,7 @@ def collect(
 
 
 def _moving(dimensions: pd.DataFrame) -> list[RenderableType]:
-    """The table of dimensions without those that never change (the kitchen has thirty), which are counted."""
+    """The table of dimensions without constant ones (the kitchen has thirty), which are counted."""
     constant = dimensions["lowest"] == dimensions["highest"]
     shown = dimensions[~constant]
     if not dimensions["name"].any():
@@ -162,7 +162,7 @@ def _advice(trajectories: Trajectories) -> str:
     from datamodules.listing import fitting_tasks
 
     found = fitting_tasks(trajectories.name, widths=(trajectories.observation_dim, trajectories.action_dim))
-    which = f"it may be {' or '.join(found)}" if found else "but none of the table has these widths"
+    which = f"it may be {' or '.join(found)}" if found else "but no task of the table has these widths"
     return f"--task NAME adds names, scores and, in mazes, the visited places; {which}"
 
 

@@ -106,7 +106,7 @@ def prepare(words: list[str]) -> list[str]:
     (or the same as two words) is collected for the `fit` command of that stage.
 
     Raises:
-        UserError: such an option without a value.
+        UserError: Such an option without a value.
     """
     flags = {
         f"--{name}"

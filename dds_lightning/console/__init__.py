@@ -1,1 +1,1 @@
-"""What whoever sits at the terminal sees and does: reports, progress, stopping."""
+"""What a person at the terminal sees and does: reports, progress, interrupts."""

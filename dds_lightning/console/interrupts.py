@@ -1,8 +1,8 @@
-"""Ctrl-C and SIGTERM: stop at a place from which the work can go on, and say so with the exit status.
+"""Ctrl-C and SIGTERM: stop where the work can be resumed, and report it in the exit status.
 
 Outside a training the first signal raises `Interrupted` at once. Inside `deferred()` it only sets a mark,
 which the checkpoint callback sees after the next optimiser step: it saves and raises there. A second signal
-never waits.
+is never deferred.
 """
 
 import signal
@@ -18,8 +18,8 @@ class Interrupted(SystemExit):
     """The user or the scheduler asked to stop; the exit status is 128 + the signal, as shells expect.
 
     Args:
-        signum: the signal.
-        saved: the checkpoint that holds the state at the stop, if one was written.
+        signum: The signal.
+        saved: Path of the checkpoint that was written before stopping, if any.
     """
 
     def __init__(self, signum: int, saved: str | None = None) -> None:
@@ -35,7 +35,7 @@ class _Mark:
 
 
 def pending() -> int | None:
-    """The signal that waits for the next safe place, or None."""
+    """The signal that waits for the next safe point, or None."""
     return _Mark.signum
 
 
@@ -49,7 +49,7 @@ def _on_signal(signum: int, frame: FrameType | None) -> None:
 
 @contextmanager
 def caught() -> Iterator[None]:
-    """Turn SIGINT and SIGTERM into `Interrupted` inside the block; does nothing off the main thread."""
+    """Turn SIGINT and SIGTERM into `Interrupted` inside the block; do nothing outside the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -64,7 +64,7 @@ def caught() -> Iterator[None]:
 
 
 def take_back() -> None:
-    """Inside `caught()`, handle the signals again after somebody else (a Trainer) has put handlers of its own."""
+    """Inside `caught()`, handle the signals again after other code (a Trainer) has installed its own handlers."""
     if _Mark.catching and threading.current_thread() is threading.main_thread():
         for signum in SIGNALS:
             signal.signal(signum, _on_signal)
@@ -72,7 +72,7 @@ def take_back() -> None:
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Let the first signal wait until `pending()` is asked; one that nobody asked about raises at the end."""
+    """Hold back the first signal so that `pending()` reports it; one that is still pending raises at the end."""
     _Mark.deferring, _Mark.signum = True, None
     try:
         yield

@@ -1,4 +1,4 @@
-"""What a command has to say, once for people and once for programs."""
+"""The result of a command, for people and for programs."""
 
 import json
 import math
@@ -19,9 +19,9 @@ class Report:
     """The result of a command.
 
     Attributes:
-        data: what `--json` prints; anything made of dicts, lists, numbers, strings, arrays and tables.
-        text: what a person reads: lines and rich tables.
-        status: exit status of the command.
+        data: What `--json` prints: anything made of dicts, lists, numbers, strings, arrays and tables.
+        text: What a person reads: lines and rich tables.
+        status: Exit status of the command.
     """
 
     data: Any
@@ -29,7 +29,7 @@ class Report:
     status: int = 0
 
     def print(self, as_json: bool) -> None:
-        """Print one of the two to standard output."""
+        """Print the data or the text to standard output."""
         if as_json:
             print(json.dumps(plain(self.data), indent=2, allow_nan=False))
             return
@@ -42,7 +42,7 @@ class Report:
 
 
 def plain(value: Any) -> Any:
-    """Turn tables, arrays, paths and tuples into what JSON can say; NaN and infinity become null."""
+    """Convert tables, arrays, paths and tuples to JSON types; NaN and infinity become null."""
     if hasattr(value, "to_dict") and hasattr(value, "columns"):
         return [plain(row) for row in value.to_dict(orient="records")]
     if hasattr(value, "tolist"):
@@ -59,7 +59,7 @@ def plain(value: Any) -> Any:
 
 
 def pairs(lines: Iterable[tuple[str, Any]], title: str | None = None) -> "Table":
-    """Draw facts below each other: name and value, long values wrapped beside their name."""
+    """Draw names and values in two columns; long values wrap beside their names."""
     from rich.table import Table
 
     drawn = Table(title=title, title_justify="left", box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
@@ -71,7 +71,7 @@ def pairs(lines: Iterable[tuple[str, Any]], title: str | None = None) -> "Table"
 
 
 def table(frame: "pd.DataFrame", title: str | None = None, digits: int = 3) -> "Table":
-    """Draw a DataFrame as a rich table: numbers to the right, missing values as a dash."""
+    """Draw a DataFrame as a rich table: numbers right-aligned, missing values as a dash."""
     from rich import box
     from rich.table import Table
 

@@ -9,7 +9,9 @@
 A slot plays a fixed list of seeds one after the other, so short episodes are never over-counted; a slot
 whose list is done is neither stepped nor acted upon. Workers are plain `python -c` children: they work from
 notebooks, from scripts without a `__main__` guard and under pytest, import no torch, and end when their
-caller does, because their input ends.
+caller does, because their input ends. gymnasium's and stable-baselines3's vector environments offer none of this: they
+reset to seeds of their own choice, step every slot until the end, and their processes need a `__main__` guard. They do
+serve where data are endless, as in online training.
 """
 
 from __future__ import annotations

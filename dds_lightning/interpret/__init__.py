@@ -25,7 +25,8 @@ _FILES = {
     "measure.comparison": ("cluster_skills", "compare_recovery", "decoding_error"),
     "measure.information": ("mutual_information",),
     "measure.recovery": ("code_recovery", "encode_replays", "round_trip"),
-    "measure.replay": ("body_states", "draw_states", "junctions", "replay_codes", "rest_states", "simulator"),
+    "measure.replay": ("replay_codes", "simulator"),
+    "measure.states": ("body_states", "draw_states", "junctions", "rest_states"),
     "measure.statistics": (
         *("code_distances", "code_segments", "decoder_diversity", "nearest_codes", "segment_effects"),
         *("skill_table", "transition_matrix"),

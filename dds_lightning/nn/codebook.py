@@ -1,29 +1,19 @@
 """The discrete skill space: K vectors, nearest-neighbour quantisation, straight-through gradient (section 4.1)."""
 
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, Self
 
 import torch
 from torch import Tensor, nn
 
 import dds_lightning.losses as losses
+from dds_lightning.nn.bottleneck import Bottleneck, Skill, Term
+from dds_lightning.nn.usage import perplexity
 
 CodebookInit = Literal["kmeans", "uniform", "normal"]
 
 
-class Quantised(NamedTuple):
-    """What quantising a batch of encodings gives."""
-
-    vectors: Tensor
-    """(B, D) skill vectors; the gradient passes straight through to the encodings."""
-    codes: Tensor
-    """(B,) int64 indices into the codebook."""
-    codebook_loss: Tensor
-    """Scalar ||sg[E] - z||^2, which moves the vectors only; 0 with an EMA codebook."""
-    commitment_loss: Tensor
-    """Scalar ||sg[z] - E||^2, which moves the encoder only; not yet weighted by beta."""
-
-
-class Codebook(nn.Module):
+class Codebook(Bottleneck):
     """K skill vectors of dimension D.
 
     The distance is computed in float32 whatever the precision of the rest: in bfloat16 neighbouring codes tie.
@@ -31,32 +21,46 @@ class Codebook(nn.Module):
     Args:
         num_skills: K.
         skill_dim: D.
-        init: start of the vectors. ``uniform`` in +-1/K as VQ-VAE; ``normal`` N(0, 1), which collapses (kept for the
+        init: Start of the vectors. ``uniform`` in +-1/K as VQ-VAE; ``normal`` N(0, 1), which collapses (kept for the
             ablation); ``kmeans`` leaves them uniform until `start_from` is called with encodings of the data.
         ema_decay: None trains the vectors by the codebook loss (the paper); a number in (0, 1) instead moves each to
             the running mean of its encodings.
+        commitment: Weight of the commitment loss, beta of equation 14.
     """
 
+    discrete = True
     initted: Tensor
     usage: Tensor
     ema_count: Tensor
     ema_sum: Tensor
 
     def __init__(
-        self, num_skills: int, skill_dim: int, init: CodebookInit = "kmeans", ema_decay: float | None = None
+        self,
+        num_skills: int,
+        skill_dim: int,
+        init: CodebookInit = "kmeans",
+        ema_decay: float | None = None,
+        commitment: float = 0.25,
     ) -> None:
         super().__init__()
-        self.ema_decay = ema_decay
+        self.ema_decay, self.commitment = ema_decay, commitment
         vectors = torch.randn(num_skills, skill_dim)
         if init != "normal":
             vectors.uniform_(-1.0 / num_skills, 1.0 / num_skills)
         self.vectors = nn.Parameter(vectors, requires_grad=ema_decay is None)
         # Training state lives in buffers and is changed in place: a replaced buffer loses its device and checkpoint.
+        # "initted" is a misspelling that stays: shipped weights have this key.
         self.register_buffer("initted", torch.tensor(init != "kmeans"))
         self.register_buffer("usage", torch.full((num_skills,), 1.0 / num_skills))
         if ema_decay is not None:
             self.register_buffer("ema_count", torch.ones(num_skills))
             self.register_buffer("ema_sum", vectors.clone())
+
+    @classmethod
+    def build(cls, settings: Any) -> Self:
+        """As `Bottleneck.build`."""
+        h = settings
+        return cls(h.num_skills, h.skill_dim, h.codebook_init, h.codebook_ema, h.commitment)
 
     @property
     def num_skills(self) -> int:
@@ -73,8 +77,14 @@ class Codebook(nn.Module):
         """Skill vectors (..., D) of codes (...)."""
         return self.vectors[codes]
 
-    def forward(self, encodings: Tensor) -> Quantised:
-        """Quantise encodings (B, D); while training also keep the usage statistics."""
+    def forward(self, encodings: Tensor) -> Skill:
+        """Quantise encodings (B, D); while training also update the usage statistics.
+
+        Returns:
+            The nearest vectors, through which the gradient passes straight to the encodings; their codes; and the
+            terms ``codebook``, ||sg[E] - z||^2, which moves the vectors only (0 with an EMA codebook), and
+            ``commitment``, ||sg[z] - E||^2, which moves the encoder only.
+        """
         encodings = encodings.float()
         codes = self.nearest(encodings)
         vectors = self.lookup(codes)  # (B, D)
@@ -84,11 +94,12 @@ class Codebook(nn.Module):
         if self.ema_decay is not None:
             codebook_loss = torch.zeros_like(codebook_loss)
         straight_through = encodings + (vectors - encodings).detach()
-        return Quantised(straight_through, codes, codebook_loss, commitment_loss)
+        terms = {"codebook": Term(codebook_loss), "commitment": Term(commitment_loss, self.commitment)}
+        return Skill(straight_through, codes, terms)
 
     @torch.no_grad()
     def _observe(self, encodings: Tensor, codes: Tensor) -> None:
-        """Follow how often each code is used and, with EMA, move the vectors."""
+        """Update the running usage of each code and, with EMA, move the vectors."""
         counts = torch.bincount(codes, minlength=self.num_skills).to(encodings.dtype)  # (K,)
         self.usage.lerp_(counts / codes.numel(), 0.02)
         if self.ema_decay is None:
@@ -103,12 +114,17 @@ class Codebook(nn.Module):
 
     @torch.no_grad()
     def set_vectors(self, rows: Tensor, vectors: Tensor) -> None:
-        """Put ``vectors`` (R, D) into ``rows`` (R,) and count them as used once again."""
+        """Put ``vectors`` (R, D) into ``rows`` (R,) and reset their usage to the uniform share."""
         self.vectors[rows] = vectors.to(self.vectors)
         self.usage[rows] = 1.0 / self.num_skills
         if self.ema_decay is not None:
             self.ema_count[rows] = 1.0
             self.ema_sum[rows] = vectors.to(self.ema_sum)
+
+    def start(self, encodings: Callable[[], Tensor]) -> None:
+        """As `Bottleneck.start`: by k-means."""
+        if not bool(self.initted):
+            self.start_from(encodings())
 
     @torch.no_grad()
     def start_from(self, encodings: Tensor, seed: int = 0) -> None:
@@ -123,17 +139,27 @@ class Codebook(nn.Module):
         )
         self.initted.fill_(True)
 
+    def revive(
+        self, encodings: Callable[[], Tensor], threshold: float, generator: torch.Generator
+    ) -> Mapping[nn.Parameter, Tensor]:
+        """As `Bottleneck.revive`: by `restart_dead`."""
+        return {self.vectors: self.restart_dead(encodings(), threshold, generator)}
+
+    def health(self) -> Mapping[str, Tensor]:
+        """Return the ``perplexity`` of the running usage."""
+        return {"perplexity": perplexity(self.usage)}
+
     @torch.no_grad()
     def restart_dead(self, encodings: Tensor, threshold: float, generator: torch.Generator) -> Tensor:
-        """Move each code whose share fell under ``threshold / K`` to an encoding that is badly served today.
+        """Move each code whose share fell under ``threshold / K`` to an encoding that is badly served now.
 
         Args:
-            encodings: (N, D) encodings to choose from; far ones are likelier, as in k-means++.
-            threshold: share of uniform usage under which a code counts as dead.
-            generator: the random stream, so that training stays reproducible.
+            encodings: (N, D) to choose from; far ones are likelier, as in k-means++.
+            threshold: Share of uniform usage under which a code counts as dead.
+            generator: The random stream, so that training stays reproducible.
 
         Returns:
-            (R,) the rows that were moved; whoever holds an optimiser must forget their moments.
+            (R,) the rows that were moved.
         """
         dead = torch.nonzero(self.usage < threshold / self.num_skills).flatten()
         if dead.numel() == 0:

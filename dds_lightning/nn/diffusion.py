@@ -51,11 +51,11 @@ class ResidualMLP(nn.Module):
     """The layer-normalised residual backbone that both decoders share.
 
     Args:
-        input_dim: width of the concatenated input.
+        input_dim: Width of the concatenated input.
         output_dim: A.
-        hidden_dim: width of the blocks.
-        blocks: number of residual blocks.
-        dropout: rate inside the blocks.
+        hidden_dim: Width of the blocks.
+        blocks: Number of residual blocks.
+        dropout: Rate inside the blocks.
     """
 
     def __init__(
@@ -78,15 +78,15 @@ class DiffusionDecoder(nn.Module):
         observation_dim: O.
         action_dim: A.
         skill_dim: D.
-        hidden_dim: width of the backbone.
-        blocks: residual blocks.
-        dropout: rate inside the blocks.
+        hidden_dim: Width of the backbone.
+        blocks: Residual blocks.
+        dropout: Rate inside the blocks.
         diffusion_steps: T.
-        beta_min: start of the VP schedule.
-        beta_max: end of the VP schedule.
-        time_dim: width of the time embedding.
+        beta_min: Start of the VP schedule.
+        beta_max: End of the VP schedule.
+        time_dim: Width of the time embedding.
         sampler: ``ddpm`` draws from the posterior, ``ddim`` follows the deterministic path (Song et al., 2020).
-        clip: keep the predicted x0 in [-1, 1] at every step.
+        clip: Keep the predicted x0 in [-1, 1] at every step.
     """
 
     betas: Tensor
@@ -153,9 +153,9 @@ class DiffusionDecoder(nn.Module):
         Args:
             observations: (B, O) normalised.
             skills: (B, D).
-            noise_scale: factor on every Gaussian that is drawn, the first as well; 1 is the model's own
-                distribution, less is nearer to its mode, 0 draws nothing and is deterministic.
-            generator: random stream; the global one without it.
+            noise_scale: Factor on every Gaussian that is drawn, the first as well; 1 is the model's
+                distribution, less is closer to its mode, 0 is deterministic.
+            generator: Random stream; the global one by default.
 
         Returns:
             (B, A), in [-1, 1] when ``clip`` is set.
@@ -166,7 +166,7 @@ class DiffusionDecoder(nn.Module):
 
     @property
     def draws(self) -> int:
-        """Gaussians that one action takes: the first, and for ``ddpm`` one after every step but the last."""
+        """Number of Gaussians that one action takes: the first, and for ``ddpm`` one after every step but the last."""
         return self.diffusion_steps if self.sampler == "ddpm" else 1
 
     def denoise(self, noise: Tensor, observations: Tensor, skills: Tensor) -> Tensor:
@@ -211,9 +211,9 @@ class MLPDecoder(nn.Module):
         observation_dim: O.
         action_dim: A.
         skill_dim: D.
-        hidden_dim: width of the backbone.
-        blocks: residual blocks.
-        dropout: rate inside the blocks.
+        hidden_dim: Width of the backbone.
+        blocks: Residual blocks.
+        dropout: Rate inside the blocks.
     """
 
     def __init__(

@@ -37,12 +37,12 @@ class TransformerEncoder(nn.Module):
 
     Args:
         input_dim: O + A.
-        output_dim: width of the result; D for a codebook, 2 D for a Gaussian bottleneck.
+        output_dim: Width of the result; D for a codebook, 2 D for a Gaussian bottleneck.
         horizon: H, the number of learnable positions.
-        hidden_dim: width of the layers; the feed-forward part is four times as wide.
-        layers: number of transformer layers.
-        heads: attention heads; must divide ``hidden_dim``.
-        dropout: rate inside the layers.
+        hidden_dim: Width of the layers; the feed-forward part is four times as wide.
+        layers: Number of transformer layers.
+        heads: Attention heads; must divide ``hidden_dim``.
+        dropout: Rate inside the layers.
     """
 
     def __init__(
@@ -86,12 +86,12 @@ class GRUEncoder(nn.Module):
 
     Args:
         input_dim: O + A.
-        output_dim: width of the result.
+        output_dim: Width of the result.
         horizon: H; kept so that both encoders are built alike.
-        hidden_dim: width of the embedding and of the projection.
-        layers: number of stacked GRU layers, and of the transformer layers whose size is matched.
-        heads: ignored by a GRU.
-        dropout: rate between the layers.
+        hidden_dim: Width of the embedding and of the projection.
+        layers: Number of stacked GRU layers, and of the transformer layers whose size is matched.
+        heads: Ignored by a GRU.
+        dropout: Rate between the layers.
     """
 
     def __init__(

@@ -28,10 +28,10 @@ class FourierFeatures(nn.Module):
     frequencies are drawn once and kept as a buffer.
 
     Args:
-        input_dim: width of the input.
-        features: number of frequencies F; the output has input_dim + 2 F dimensions.
-        scale: standard deviation of the frequencies, in cycles per unit of normalised input times 2 pi.
-        seen: how many leading numbers of the input the frequencies see; 0 for all of them.
+        input_dim: Width of the input.
+        features: Number of frequencies F; the output has input_dim + 2 F dimensions.
+        scale: Standard deviation of the frequencies, in cycles per unit of normalised input times 2 pi.
+        seen: How many leading numbers of the input the frequencies see; 0 for all of them.
     """
 
     frequencies: Tensor
@@ -51,10 +51,10 @@ class MLP(nn.Sequential):
     """Linear layers with ReLU between them; ``members`` > 0 makes an ensemble with a leading axis.
 
     Args:
-        input_dim: width of the input.
-        output_dim: width of the output.
-        hidden_dims: widths of the hidden layers (the paper: 256, 256).
-        layer_norm: normalise before each ReLU.
+        input_dim: Width of the input.
+        output_dim: Width of the output.
+        hidden_dims: Widths of the hidden layers (the paper: 256, 256).
+        layer_norm: Normalise before each ReLU.
         members: 0 for a plain network (..., I) to (..., J); N for an ensemble (N, B, I) to (N, B, J).
     """
 

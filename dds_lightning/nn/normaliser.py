@@ -16,7 +16,7 @@ class Normaliser(nn.Module):
     """Affine map of observations to zero mean and unit standard deviation.
 
     Args:
-        dim: width O of an observation.
+        dim: Width O of an observation.
     """
 
     mean: Tensor
@@ -33,7 +33,7 @@ class Normaliser(nn.Module):
         """Take over the statistics (each (O,)) of the training data, in place.
 
         Raises:
-            UserError: the statistics have another width than the model.
+            UserError: The statistics have another width than the model.
         """
         if mean.shape != self.mean.shape:
             raise UserError(
@@ -53,7 +53,7 @@ class ActionBox(nn.Module):
     """Affine map between an action box and the cube [-1, 1] in which the decoder works.
 
     Args:
-        dim: width A of an action.
+        dim: Width A of an action.
     """
 
     low: Tensor

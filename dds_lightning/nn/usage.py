@@ -5,16 +5,20 @@ from torch import Tensor
 from torchmetrics import Metric
 
 
+def perplexity(share: Tensor) -> Tensor:
+    """``exp(H)`` of a distribution over codes (K,), as a scalar: K if uniform, 1 after a collapse."""
+    return (-torch.special.xlogy(share, share).sum()).exp()
+
+
 class CodebookUsage(Metric):
     """How a codebook is used over an epoch: perplexity, codes in use, dead codes.
 
-    A code is *in use* when its share of the epoch reaches ``threshold / K``. Perplexity is ``exp(H)`` of the code
-    distribution: K when all are used alike, 1 after a collapse. Measured over an epoch: a single batch of a few
-    hundred segments calls rare codes dead.
+    A code is *in use* when its share of the epoch reaches ``threshold / K``. Measured over an epoch, because a single
+    batch of a few hundred segments would call rare codes dead.
 
     Args:
         num_skills: K.
-        threshold: share of the uniform usage 1 / K from which a code counts as used.
+        threshold: Share of the uniform usage 1 / K from which a code counts as used.
     """
 
     full_state_update = False
@@ -32,6 +36,5 @@ class CodebookUsage(Metric):
     def compute(self) -> dict[str, Tensor]:
         """Return ``perplexity``, ``codes_used`` and ``dead_codes`` as scalars."""
         share = self.counts / self.counts.sum().clamp_min(1.0)  # (K,)
-        entropy = -torch.special.xlogy(share, share).sum()
         used = (share >= self.threshold / len(share)).sum().float()
-        return {"perplexity": entropy.exp(), "codes_used": used, "dead_codes": len(share) - used}
+        return {"perplexity": perplexity(share), "codes_used": used, "dead_codes": len(share) - used}

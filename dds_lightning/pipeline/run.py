@@ -15,6 +15,7 @@ from dds_lightning.errors import UserError
 from dds_lightning.pipeline.settings import RunSettings, Trainings
 from dds_lightning.pipeline.steps import STEPS
 from dds_lightning.saving.run_directory import Done, RunDirectory, duration, locked
+from dds_lightning.study.run_task import keep_task
 from dds_lightning.tasks import Task, get_task
 from dds_lightning.training.fit import quieten
 
@@ -43,6 +44,7 @@ class Run:
         quieten()
         self.wanted: RunSettings = settings
         self.task: Task = get_task(settings.task)
+        self._asked = self.task
         self.out = settings.out
         for name, value in (
             ("data_steps", settings.data_steps),
@@ -65,7 +67,8 @@ class Run:
 
             refuse_uncollectable(self.task)
             return None
-        from datamodules.sources import resolve_task, stat_hash
+        from datamodules.sources import resolve_task
+        from datamodules.sources.stat_hash import stat_hash
 
         files = stat_hash(spec)
         self.task = resolve_task(spec, self.task)
@@ -100,9 +103,10 @@ class Run:
     def everything(self) -> Report:
         """Do the steps up to the one asked for, and report what they made."""
         with locked(self.out):
-            if self.task.name != self.wanted.task:
+            if self.task != self._asked:
                 chosen = f"evaluating in {self.task.name} ({self.task.env_id})"
-                self.say(f"the data were recorded in another physics than {self.wanted.task}'s: {chosen}")
+                self.say(f"the data were recorded in another physics than {self._asked.name}'s: {chosen}")
+            keep_task(self.out, self.task)
             directory = RunDirectory(self.out, self._console, self.wanted.fresh)
             for step in STEPS.values():
                 self._done[step.name] = directory.do(

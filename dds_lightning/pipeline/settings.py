@@ -3,16 +3,17 @@
 import json
 import shlex
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 from jsonargparse import Namespace
 
+from datamodules.relabelling import Relabelling
 from dds_lightning.configs import RUN_DEFAULTS, run_defaults
 from dds_lightning.console.reports import Report
 from dds_lightning.errors import UserError
-from dds_lightning.tasks import Task, get_task
+from dds_lightning.tasks import Task, get_task, is_own
 from dds_lightning.training.stage_cli import StageCLI, command_line, parsed
 from dds_lightning.training.stages import STAGES, preset_configs
 
@@ -89,6 +90,7 @@ class Trainings:
 
     def __init__(self, wanted: RunSettings, task: Task) -> None:
         self.wanted, self.task = wanted, task
+        self.task_address = wanted.task if is_own(task) else task.name
         self.preset = preset_configs(wanted.preset or task.family)
         # How often the policy is evaluated follows from its steps, which only its parsed settings say.
         self.evaluate_every = self._asked_interval()
@@ -158,7 +160,7 @@ class Trainings:
         config = self.preset[stage]
         arguments = ["fit", *(["--config", str(config)] if config else [])]
         arguments += [f"--seed_everything={wanted.seed}", f"--data.seed={wanted.seed}"]
-        arguments += [f"--data.task={self.task.name}", f"--data.data={spec}"]
+        arguments += [f"--data.task={self.task_address}", f"--data.data={spec}"]
         if stage == "policy":
             checkpoint = skill or wanted.out / "skill" / "last.ckpt"
             arguments += [f"--data.skill={checkpoint}", f"--data.cache={wanted.out / 'relabel'}", *self._watching()]
@@ -181,6 +183,10 @@ class Trainings:
         data = {key: value for key, value in config["data"].items() if key not in ("data", "skill", "cache")}
         best = {key: value for key, value in config["best"].items() if key != "every_n_steps" or value is not None}
         chosen = {"trainer": trainer, "model": config["model"], "data": data, "best": best}
+        if config["average"]["decay"] is not None:
+            chosen["average"] = config["average"]
+        if config["stop"]["when"] != "steps":
+            chosen["stop"] = config["stop"]
         return {"seed": config["seed_everything"], **chosen}
 
     def former_settings(self, stage: str) -> dict[str, Any]:
@@ -202,8 +208,7 @@ class Trainings:
     def relabelling(self) -> dict[str, Any]:
         """The settings of relabelling, which are the policy's data's."""
         data = self._parsed["policy"].settings.data
-        names = ("gamma", "discount", "stride", "reward_scale", "reward_shift")
-        return {name: data[name] for name in names}
+        return {one.name: data[one.name] for one in fields(Relabelling)}
 
     # ---------------------------------------------------------------- doing it
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dds_lightning.study import contestants, protocol
+from dds_lightning.tasks import facts_to_keep
 
 if TYPE_CHECKING:
     from dds_lightning.agent import DDSAgent
@@ -59,7 +60,7 @@ def _data_title(run: Run) -> str:
 
 def _data_settings(run: Run) -> Settings:
     wanted = run.wanted
-    settings: Settings = {"task": run.task.name, "data": wanted.data}
+    settings: Settings = {**facts_to_keep(run.task), "data": wanted.data}
     if wanted.data is None:
         return {**settings, "steps": wanted.data_steps, "seed": wanted.seed}
     return {**settings, "files": run.data_hash}
@@ -150,7 +151,7 @@ def _relabel(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
 def _evaluation_settings(run: Run) -> Settings:
     wanted = run.wanted
     settings: Settings = {
-        "task": run.task.name,
+        **facts_to_keep(run.task),
         "seed": wanted.seed,
         "episodes": run.episodes,
         "episodes_per_skill": wanted.episodes_per_skill,
@@ -193,16 +194,17 @@ def _evaluate(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
     result.save(folder)
     results = json.loads(result.summary().round(4).to_json(orient="records"))  # NaN becomes null
     metrics = {"episodes": run.episodes, "seed": wanted.seed, "results": results}
+    kept = facts_to_keep(task)
     made: dict[str, Any] = {
         "protocol": protocol.protocol(
             task, agent, episodes=run.episodes, seed=wanted.seed, temperature=wanted.temperature, best=chosen
         ),
         "start_value": plain(protocol.start_value(task, agent, wanted.seed)),
-        "agent": agent.save(run.out / "agent", metrics=metrics, card=_card(run, result.episodes), task=task.name),
+        "agent": agent.save(run.out / "agent", metrics=metrics, card=_card(run, result.episodes), **kept),
     }
     if best:
         place = run.out / contestants.BEST_AGENT
-        made["best"] = best.save(place, metrics=metrics, task=task.name, checkpoint=chosen)
+        made["best"] = best.save(place, metrics=metrics, **kept, checkpoint=chosen)
     return {"episodes": folder / "episodes.parquet", **made, "results": results}
 
 

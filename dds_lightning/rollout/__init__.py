@@ -1,4 +1,4 @@
-"""Who plays, where each sits, the match, and the table it leaves.
+"""Rollouts: who plays, on which schedule, the match, and its table.
 
 The names below are imported on first use: a process that only steps environments needs neither torch nor pandas.
 """
@@ -7,6 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from dds_lightning.rollout.actors import Acted as Acted
     from dds_lightning.rollout.actors import Actor as Actor
     from dds_lightning.rollout.actors import Contestant as Contestant
     from dds_lightning.rollout.actors import RandomActor as RandomActor
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from dds_lightning.rollout.schedule import slots_needed as slots_needed
 
 _FILES = {
-    "actors": ("Actor", "Contestant", "RandomActor", "single_skills"),
+    "actors": ("Acted", "Actor", "Contestant", "RandomActor", "single_skills"),
     "play": ("rollout",),
     "result": ("RolloutPath", "RolloutResult"),
     "schedule": ("episode_seed", "slots_needed"),
@@ -26,7 +27,7 @@ _FILES = {
 _HOMES = {name: file for file, names in _FILES.items() for name in names}
 
 __all__ = [
-    *("Actor", "Contestant", "RandomActor", "RolloutPath", "RolloutResult"),
+    *("Acted", "Actor", "Contestant", "RandomActor", "RolloutPath", "RolloutResult"),
     *("episode_seed", "rollout", "single_skills", "slots_needed"),
 ]
 

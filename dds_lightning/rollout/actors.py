@@ -1,10 +1,10 @@
-"""Whoever acts in environments: what an actor is, and how several agents share one decoder batch."""
+"""What acts in environments: what an actor is, and how several agents share one decoder batch."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -14,19 +14,26 @@ if TYPE_CHECKING:
     from dds_lightning.agent import DDSAgent
 
 
-class Actor(Protocol):
-    """An agent, a controller, a baseline.
+class Acted(NamedTuple):
+    """What an actor did in one step, in n environments."""
 
-    An actor that has skills also has `codes`, (E,) int64 code in use, and `decided`, (E,) bool whether the
-    last act chose it anew.
-    """
+    actions: NDArray[np.float32]
+    """(n, A) in the environment's units."""
+    codes: NDArray[np.int64] | None = None
+    """(n,) the skill in use; None for an actor without skills."""
+    chosen: NDArray[np.bool_] | None = None
+    """(n,) whether the skill was chosen in this step."""
+
+
+class Actor(Protocol):
+    """An agent, a controller, a baseline; anything that a `Contestant` plays with."""
 
     def reset(self, num_envs: int, seed: int | None = None) -> None:
         """Forget everything and get ready for `num_envs` environments."""
 
     def act(
         self, observations: NDArray[np.float32], restarted: NDArray[np.bool_], rows: NDArray[np.intp]
-    ) -> NDArray[np.float32]:
+    ) -> Acted | NDArray[np.float32]:
         """Act in the environments `rows`; the others have played their last episode.
 
         Args:
@@ -35,7 +42,7 @@ class Actor(Protocol):
             rows: (n,), indices among `num_envs`, ascending.
 
         Returns:
-            (n, A) in the environment's units.
+            What it did; the actions (n, A) alone are enough for an actor without skills.
         """
         ...
 
@@ -45,8 +52,8 @@ class RandomActor:
 
     Args:
         action_dim: A.
-        low: lower bound of every action entry.
-        high: upper bound of every action entry.
+        low: Lower bound of every action entry.
+        high: Upper bound of every action entry.
     """
 
     def __init__(self, action_dim: int, low: float = -1.0, high: float = 1.0) -> None:
@@ -55,24 +62,22 @@ class RandomActor:
         self._random = np.random.default_rng(0)
 
     def reset(self, num_envs: int, seed: int | None = None) -> None:
-        """Start the random stream anew."""
+        """Restart the random stream."""
         self._random = np.random.default_rng(seed)
 
-    def act(
-        self, observations: NDArray[np.float32], restarted: NDArray[np.bool_], rows: NDArray[np.intp]
-    ) -> NDArray[np.float32]:
+    def act(self, observations: NDArray[np.float32], restarted: NDArray[np.bool_], rows: NDArray[np.intp]) -> Acted:
         """As `Actor.act`."""
-        return self._random.uniform(self.low, self.high, (len(rows), self.action_dim)).astype(np.float32)
+        return Acted(self._random.uniform(self.low, self.high, (len(rows), self.action_dim)).astype(np.float32))
 
 
 class AgentGroup:
-    """Agents on one skill model as one actor: each chooses its own codes, one decoder batch acts for all.
+    """One or several agents on one skill model as one actor: each chooses its codes, one decoder batch acts for all.
 
     Rows are the agents' environments, one agent after the other. A small decoder batch costs almost as much
     as a large one, so this is what makes a table of many contestants cheap.
 
     Args:
-        agents: with equal `group_key`, no agent twice.
+        agents: With equal `group_key`, no agent twice.
     """
 
     def __init__(self, agents: Sequence[DDSAgent]) -> None:
@@ -87,58 +92,20 @@ class AgentGroup:
             agent.reset(size, seed)
         self._starts = np.concatenate([[0], np.cumsum(sizes)])
 
-    @property
-    def codes(self) -> NDArray[np.int64]:
-        """(E,) code in use, one agent after the other."""
-        return np.concatenate([agent.codes for agent in self.agents])
-
-    @property
-    def decided(self) -> NDArray[np.bool_]:
-        """(E,) whether the last act chose a new skill there."""
-        return np.concatenate([agent.decided for agent in self.agents])
-
     @torch.inference_mode()
-    def act(
-        self, observations: NDArray[np.float32], restarted: NDArray[np.bool_], rows: NDArray[np.intp]
-    ) -> NDArray[np.float32]:
+    def act(self, observations: NDArray[np.float32], restarted: NDArray[np.bool_], rows: NDArray[np.intp]) -> Acted:
         """As `Actor.act`, rows counted over all agents."""
         lead = self.agents[0]
-        x = torch.from_numpy(np.ascontiguousarray(observations)).to(lead.device)  # (n, O)
+        x = lead.observe(observations)  # (n, O)
         cuts = np.searchsorted(rows, self._starts)
-        parts = [slice(cuts[i], cuts[i + 1]) for i in range(len(self.agents))]
-        codes = [
-            agent.choose(x[part], restarted[part], rows[part] - start)
-            for agent, part, start in zip(self.agents, parts, self._starts, strict=False)
-        ]
-        return lead.decode(x, np.concatenate(codes))
-
-
-class EveryRow:
-    """Lets an actor that always acts in all of its environments play on when some of them have finished.
-
-    Args:
-        actor: with `reset(num_envs, seed)` and `act(observations, restarted)`.
-    """
-
-    def __init__(self, actor: Any) -> None:
-        self.actor = actor
-        self.num_envs = 0
-        self._last: NDArray[np.float32] | None = None
-
-    def reset(self, num_envs: int, seed: int | None = None) -> None:
-        """As `Actor.reset`."""
-        self.actor.reset(num_envs, seed)
-        self.num_envs, self._last = num_envs, None
-
-    def act(
-        self, observations: NDArray[np.float32], restarted: NDArray[np.bool_], rows: NDArray[np.intp]
-    ) -> NDArray[np.float32]:
-        """As `Actor.act`: finished environments are shown their last observation, and their action is dropped."""
-        if self._last is None:
-            self._last = np.zeros((self.num_envs, observations.shape[1]), np.float32)
-        begun = np.zeros(self.num_envs, bool)
-        self._last[rows], begun[rows] = observations, restarted
-        return self.actor.act(self._last, begun)[rows]
+        codes, chosen = [], []
+        for i, agent in enumerate(self.agents):
+            part = slice(cuts[i], cuts[i + 1])
+            own = rows[part] - self._starts[i]
+            codes.append(agent.choose(x[part], restarted[part], own))
+            chosen.append(agent.decided[own])
+        in_use = np.concatenate(codes)
+        return Acted(lead.decode(x, in_use), in_use, np.concatenate(chosen))
 
 
 @dataclass(frozen=True)
@@ -146,10 +113,10 @@ class Contestant:
     """Who plays, and how often.
 
     Attributes:
-        name: shown in the table; unique within a rollout.
-        actor: acts; see `Actor`.
-        episodes: how many.
-        labels: one an episode, for a contestant of several parts (each single skill). With L different
+        name: Shown in the table; unique within a rollout.
+        actor: An `Actor`, or a `DDSAgent`.
+        episodes: How many it plays.
+        labels: One for each episode, for a contestant of several parts (each single skill). With L different
             labels, row r of the actor plays only episodes of label r modulo L, in order of first appearance.
     """
 

@@ -1,11 +1,11 @@
-"""Vectorised episodes of several contestants over real environments, and one result row an episode.
+"""Vectorised episodes of several contestants over real environments, and one row of results per episode.
 
-Contestants play side by side in one `EnvPool`. Each has slots of its own and a fixed split of its episodes
-over them, so an episode that fails slowly counts as much as one that succeeds fast. Episode i of every
+Contestants play side by side in one `EnvPool`. Each has its own slots and a fixed split of its episodes over
+them, so an episode that fails slowly counts as much as one that succeeds fast. Episode i of every
 contestant starts from the same environment seed: comparisons are paired.
 
 The same call gives the same table: it depends on task, contestants, `seed` and `slots` (the rows of a batch
-share the actor's random stream), not on `workers` or how busy the machine is.
+share the actor's random stream), not on `workers` or the load of the machine.
 """
 
 from __future__ import annotations
@@ -18,24 +18,21 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from dds_lightning.console.progress import on_terminal, progress_bar
 from dds_lightning.envs.pool import EnvPool
 from dds_lightning.errors import UserError
-from dds_lightning.rollout.actors import Contestant
-from dds_lightning.rollout.actors import single_skills as single_skills
-from dds_lightning.rollout.result import RolloutPath as RolloutPath
-from dds_lightning.rollout.result import RolloutResult as RolloutResult
+from dds_lightning.rollout.actors import Acted, Contestant
+from dds_lightning.rollout.result import RolloutPath, RolloutResult
 from dds_lightning.rollout.schedule import (
     DEFAULT_SLOTS,
+    ActorSlots,
     Plan,
-    Seat,
+    assign_slots,
     bundle,
     check_contestants,
     episode_seeds,
     plan_slots,
-    take_seats,
 )
-from dds_lightning.rollout.schedule import episode_seed as episode_seed
-from dds_lightning.rollout.schedule import slots_needed as slots_needed
 from dds_lightning.tasks import Task, get_task
 
 
@@ -52,20 +49,20 @@ def rollout(
     pool: EnvPool | None = None,
     threads: int = 1,
 ) -> RolloutResult:
-    """Let contestants play their episodes.
+    """Play the episodes of all contestants.
 
     Args:
-        task: the environment, or its name.
-        contestants: who plays.
-        seed: of environments and actors.
-        workers: processes that step environments; None one a core, 0 none but this.
-        slots: environments in all; more are used when there are more contestants and labels.
-        progress: show a bar when standard error is a terminal.
-        record: keep the path of every episode.
-        record_observations: keep the observations as well.
-        pool: play in these environments instead of new ones; `workers` is then not used, and `slots` is
+        task: The environment, or its name.
+        contestants: Who plays, and how often.
+        seed: Seed of environments and actors.
+        workers: Processes that step environments; None for one a core, 0 for this process only.
+        slots: Environments in all; more are used when there are more contestants and labels.
+        progress: Show a bar when standard error is a terminal.
+        record: Keep the path of every episode.
+        record_observations: Keep the observations as well.
+        pool: Play in these environments instead of new ones; `workers` is then not used, and `slots` is
             bounded by its size.
-        threads: torch's threads while acting. One is best for small networks and on a busy machine, where
+        threads: Torch's threads while acting. One is best for small networks and on a busy machine, where
             threads that wait for a core cost far more than they bring; large networks on idle cores gain from
             more. The last bits of the table may depend on it.
 
@@ -73,27 +70,27 @@ def rollout(
         The table of episodes, in the contestants' order, and the recorded paths.
 
     Raises:
-        UserError: contestants that cannot be played; the message names them.
-        EnvPoolError: an environment failed.
+        UserError: Contestants that cannot play; the message names them.
+        EnvPoolError: An environment failed.
     """
-    task = get_task(task) if isinstance(task, str) else task
+    task = get_task(task)
     check_contestants(contestants)
     if slots < 1:
         raise UserError(f"slots is {slots}, expected at least 1")
     if pool is not None and pool.task != task:
         raise UserError(f"the pool has environments of '{pool.task.name}', expected '{task.name}'")
     bundles = bundle(contestants)
-    members = [contestant for _, own in bundles for contestant in own]
+    members = [contestant for _, bundled in bundles for contestant in bundled]
     plans = plan_slots(members, slots, pool.num_envs if pool else None)
     total = sum(len(plan.slots) for plan in plans)
     with contextlib.ExitStack() as stack:
         if pool is None:
             pool = stack.enter_context(EnvPool(task, total, workers))
         count = sum(plan.contestant.episodes for plan in plans)
-        report = stack.enter_context(_progress_bar(count, progress, "success" if task.measures_success else "score"))
+        report = stack.enter_context(_mean_so_far(count, progress, "success" if task.measures_success else "score"))
         match = _Match(pool, plans, seed, record or record_observations, record_observations, report)
         stack.enter_context(_torch_threads(threads))
-        rows = match.play(take_seats(bundles, plans, seed))
+        rows = match.play(assign_slots(bundles, plans, seed))
     order = {contestant.name: i for i, contestant in enumerate(contestants)}
     rows.sort(key=lambda row: (order[row["actor"]], row["episode"]))
     paths = {(row["actor"], row["episode"]): row.pop("path") for row in rows}
@@ -120,7 +117,7 @@ class _Match:
     ) -> None:
         self.pool, self.task, self.report = pool, pool.task, report
         self.who = [plan.contestant for plan in plans for _ in plan.slots]
-        self.todo = [list(own) for plan in plans for own in plan.slots]
+        self.todo = [list(episodes) for plan in plans for episodes in plan.slots]
         self.seeds = [episode_seeds(plan.contestant, seed) for plan in plans for _ in plan.slots]
         count, steps = len(self.todo), self.task.max_episode_steps
         self.turn = np.zeros(count, dtype=np.int64)
@@ -134,20 +131,20 @@ class _Match:
         width = self.task.observation_dim
         self.seen = np.zeros((count, steps + 1, width), np.float32) if record_observations else None
 
-    def play(self, seats: list[Seat]) -> list[dict[str, Any]]:
-        """Play to the end; a row an episode, in the order in which they end."""
+    def play(self, actors: list[ActorSlots]) -> list[dict[str, Any]]:
+        """Play to the end; return one row per episode, in the order in which they end."""
         pool = self.pool
-        start = pool.start([[own[i] for i in todo] for own, todo in zip(self.seeds, self.todo, strict=True)])
+        start = pool.start([[seeds[i] for i in todo] for seeds, todo in zip(self.seeds, self.todo, strict=True)])
         self.observations, self.restarted = start["observation"].copy(), start["alive"].copy()
         alive = pool.alive
         self._remember(alive, start["position"][alive], start["observation"][alive])
         rows: list[dict[str, Any]] = []
         while len(alive := pool.alive):
-            rows += self._note(alive, pool.step(self._act(seats, alive)))
+            rows += self._note(alive, pool.step(self._act(actors, alive)))
         return rows
 
     def _note(self, slots: NDArray[np.intp], records: NDArray[Any]) -> list[dict[str, Any]]:
-        """Take in one step of some slots: the rows of the episodes that have ended."""
+        """Record one step of some slots; return the rows of the episodes that have ended."""
         if self.in_use is not None:
             self.in_use[slots, self.lengths[slots]] = self.codes[slots]
         self.returns[slots] += records["reward"]
@@ -164,29 +161,30 @@ class _Match:
         self._remember(slots[again], records["position"][again], records["observation"][again])
         return rows
 
-    def _act(self, seats: list[Seat], slots: NDArray[np.intp]) -> NDArray[np.float32]:
-        """Everybody's actions (n, A) for some live slots, ascending."""
+    def _act(self, actors: list[ActorSlots], slots: NDArray[np.intp]) -> NDArray[np.float32]:
+        """All actions (n, A) for some live slots, ascending."""
         actions = np.empty((len(slots), self.task.action_dim), np.float32)
-        for seat in seats:
-            low, high = np.searchsorted(slots, (seat.low, seat.high))
+        for one in actors:
+            low, high = np.searchsorted(slots, (one.low, one.high))
             if low < high:
-                actions[low:high] = self._act_one(seat, slots[low:high])
+                actions[low:high] = self._act_one(one, slots[low:high])
         return actions
 
-    def _act_one(self, seat: Seat, slots: NDArray[np.intp]) -> NDArray[np.float32]:
+    def _act_one(self, one: ActorSlots, slots: NDArray[np.intp]) -> NDArray[np.float32]:
         """One actor's actions for its live slots; its codes are noted."""
-        rows = slots - seat.low
-        actions = np.asarray(seat.actor.act(self.observations[slots], self.restarted[slots], rows), dtype=np.float32)
+        acted = one.actor.act(self.observations[slots], self.restarted[slots], slots - one.low)
+        if not isinstance(acted, Acted):
+            acted = Acted(acted)
+        actions = np.asarray(acted.actions, dtype=np.float32)
         if actions.shape != (len(slots), self.task.action_dim):
             expected = (len(slots), self.task.action_dim)
-            raise UserError(f"'{seat.name}' gave actions of shape {actions.shape}, expected {expected}")
+            raise UserError(f"'{one.name}' gave actions of shape {actions.shape}, expected {expected}")
         if not np.isfinite(actions).all():
-            raise UserError(f"'{seat.name}' gave an action that is not finite; has its training diverged?")
-        codes = getattr(seat.actor, "codes", None)
-        if codes is not None:
-            self.codes[slots] = np.asarray(codes)[rows]
-            for row in np.flatnonzero(np.asarray(seat.actor.decided)[rows]):  # type: ignore[attr-defined]
-                self.chosen[slots[row]].append(int(self.codes[slots[row]]))
+            raise UserError(f"'{one.name}' gave an action that is not finite; has its training diverged?")
+        if acted.codes is not None:
+            self.codes[slots] = acted.codes
+        for slot in [] if acted.chosen is None else slots[acted.chosen]:
+            self.chosen[slot].append(int(self.codes[slot]))
         return actions
 
     def _remember(self, slots: NDArray[np.intp], positions: NDArray[Any], observations: NDArray[Any]) -> None:
@@ -196,7 +194,7 @@ class _Match:
             self.seen[slots, self.lengths[slots]] = observations
 
     def _finish(self, slot: int, record: Any) -> dict[str, Any]:
-        """The row of the episode that has just ended in a slot, and a clean slate for the next."""
+        """Return the row of the episode that has just ended in a slot, and reset the slot for the next."""
         contestant, episode = self.who[slot], self.todo[slot][self.turn[slot]]
         length = int(self.lengths[slot])
         path = None
@@ -227,7 +225,7 @@ class _Match:
 
 @contextlib.contextmanager
 def _torch_threads(count: int) -> Iterator[None]:
-    """Let torch use `count` threads."""
+    """Let torch use `count` threads inside the block."""
     import torch
 
     before = torch.get_num_threads()
@@ -239,31 +237,15 @@ def _torch_threads(count: int) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _progress_bar(total: int, wanted: bool, what: str) -> Iterator[Callable[[float], None]]:
-    """A bar of episodes done and the mean so far of "success" or "score", on standard error; silent elsewhere."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    if not (wanted and console.is_terminal):
-        yield lambda value: None
-        return
-    unit = " %" if what == "success" else ""
-    columns = (
-        TextColumn("episodes"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn(f"{what} {{task.fields[mean]:.0f}}{unit}"),
-        TimeRemainingColumn(),
-    )
-    values = 0.0
-    with Progress(*columns, console=console, transient=True) as bar:
-        line = bar.add_task("episodes", total=total, mean=0.0)
+def _mean_so_far(total: int, shown: bool, what: str) -> Iterator[Callable[[float], None]]:
+    """A bar of episodes done and the mean so far of "success" or "score"; shown on a terminal only."""
+    text = f"{what} {{task.fields[mean]:.0f}}{' %' if what == 'success' else ''}"
+    layout = ("episodes", "bar", "count", text, "remaining")
+    values: list[float] = []
+    with progress_bar(layout, total, shown=shown and on_terminal(), mean=0.0) as update:
 
         def report(value: float) -> None:
-            nonlocal values
-            values += value
-            done = bar.tasks[0].completed + 1
-            bar.update(line, advance=1, mean=values / done)
+            values.append(value)
+            update(advance=1, mean=sum(values) / len(values))
 
         yield report

@@ -1,4 +1,4 @@
-"""What a rollout leaves behind: a table with one row an episode, and, if recorded, the paths."""
+"""The result of a rollout: a table with one row per episode, and the recorded paths."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ class RolloutResult:
     """The table of a rollout.
 
     Attributes:
-        task: name of the task.
-        episodes: one row an episode: `actor`, `label` (the part of the contestant, else its name), `episode`
+        task: Name of the task.
+        episodes: One row per episode: `actor`, `label` (the part of the contestant, else its name), `episode`
             (counted within the contestant), `seed` (of the environment), `return` (environment's own
             rewards), `score` (normalised, 0 to 100), `success` (missing where the task does not measure it),
             `terminated`, `length` (steps), `final_x` and `final_y` (metres; NaN where there is no maze),
@@ -90,14 +90,14 @@ class RolloutResult:
         if self.paths:
             keys = list(zip(table["actor"], table["episode"], strict=True))
             recorded = [self.paths[key] for key in keys]
-            arrays = {
+            arrays: dict[str, Any] = {
                 "positions": np.concatenate([path.positions for path in recorded]),
                 "codes": np.concatenate([path.codes for path in recorded]),
             }
             if recorded[0].observations is not None:
                 arrays["observations"] = np.concatenate([path.observations for path in recorded])
             with written_whole(directory / _PATHS) as part, part.open("wb") as file:
-                np.savez_compressed(file, allow_pickle=False, **arrays)
+                np.savez_compressed(file, **arrays)
         else:
             (directory / _PATHS).unlink(missing_ok=True)  # of an earlier rollout
         return directory
@@ -107,7 +107,7 @@ class RolloutResult:
         """Read what `save` wrote.
 
         Raises:
-            UserError: there is no table, or the paths do not fit it.
+            UserError: There is no table, or the paths do not fit it.
         """
         directory = Path(directory)
         file = directory / _EPISODES
@@ -121,7 +121,7 @@ class RolloutResult:
                 arrays = {name: stored[name] for name in stored.files}
             lengths = table["length"].to_numpy()
             if len(arrays["codes"]) != lengths.sum() or len(arrays["positions"]) != (lengths + 1).sum():
-                raise UserError(f"{directory / _PATHS} is of another rollout than {file}: run the rollout again")
+                raise UserError(f"{directory / _PATHS} does not belong to {file}: run the rollout again")
             step = state = 0
             for actor, episode, length in zip(table["actor"], table["episode"], lengths, strict=True):
                 states = slice(state, state + length + 1)

@@ -1,4 +1,4 @@
-"""Who sits where in a rollout: slots for contestants, episodes for slots, seeds for episodes."""
+"""The schedule of a rollout: slots for contestants, episodes for slots, seeds for episodes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dds_lightning.errors import UserError
-from dds_lightning.rollout.actors import Actor, AgentGroup, Contestant
+from dds_lightning.rollout.actors import AgentGroup, Contestant
 
 DEFAULT_SLOTS = 192
 
@@ -26,39 +26,39 @@ def check_contestants(contestants: Sequence[Contestant]) -> None:
     """Refuse contestants that cannot be played.
 
     Raises:
-        UserError: names the contestant and what is wrong.
+        UserError: Names the contestant and what is wrong.
     """
     if not contestants:
-        raise UserError("contestants is empty: there is nobody to play")
+        raise UserError("contestants is empty, expected at least one")
     for name, count in Counter(contestant.name for contestant in contestants).items():
         if count > 1:
             raise UserError(f"contestant '{name}' appears {count} times: names must differ")
     if len({id(contestant.actor) for contestant in contestants}) < len(contestants):
-        raise UserError("two contestants share one actor object; give each its own (an agent's `variant()`)")
+        raise UserError("two contestants share one actor object; give each its own, for example `agent.variant()`")
     for name, episodes, labels in ((one.name, one.episodes, one.labels) for one in contestants):
         if episodes < 1:
             raise UserError(f"contestant '{name}': episodes is {episodes}, expected 1 or more")
         if labels is not None and len(labels) != episodes:
-            raise UserError(f"contestant '{name}': {len(labels)} labels for {episodes} episodes, one each expected")
+            raise UserError(f"contestant '{name}': {len(labels)} labels for {episodes} episodes, expected one each")
 
 
 def bundle(contestants: Sequence[Contestant]) -> list[tuple[Any, list[Contestant]]]:
-    """Contestants whose actors can act in one batch, together."""
+    """Group contestants whose actors can act in one batch."""
     bundles: dict[Any, list[Contestant]] = {}
     for contestant in contestants:
-        own = getattr(contestant.actor, "group_key", None)
-        key = contestant.name if own is None else (type(contestant.actor), own)
+        group = getattr(contestant.actor, "group_key", None)
+        key = contestant.name if group is None else (type(contestant.actor), group)
         bundles.setdefault(key, []).append(contestant)
     return list(bundles.items())
 
 
 def slots_needed(contestants: Sequence[Contestant], slots: int = DEFAULT_SLOTS) -> int:
-    """Environments that a rollout of these contestants with `slots` uses."""
+    """Return how many environments a rollout of these contestants with `slots` uses."""
     return sum(len(plan.slots) for plan in plan_slots(contestants, slots))
 
 
 def plan_slots(contestants: Sequence[Contestant], slots: int, most: int | None = None) -> list[Plan]:
-    """Everybody's plan, with fewer slots each if there are no more than `most`."""
+    """Plan all contestants, with fewer slots each if only `most` are available."""
     episodes = sum(contestant.episodes for contestant in contestants)
     for limit in range(slots, 0, -1):
         plans = [_plan_one(contestant, limit * contestant.episodes / episodes) for contestant in contestants]
@@ -77,35 +77,36 @@ def _plan_one(contestant: Contestant, share: float) -> Plan:
     most = max(map(len, members.values()))
     wide = max(1, int(share / len(members)))  # slots a label
     wide = -(-most // -(-most // wide))  # no wider than the longest slot's episodes need
-    slots = [own[turn::wide] for turn in range(wide) for own in members.values()]
+    slots = [episodes[turn::wide] for turn in range(wide) for episodes in members.values()]
     return Plan(contestant, slots)
 
 
-class Seat(NamedTuple):
-    """An actor and the range of slots it plays."""
+class ActorSlots(NamedTuple):
+    """An actor and the range of slots that it plays, `low` to `high` - 1."""
 
     name: str
-    actor: Actor
+    actor: Any
     low: int
     high: int
 
 
-def take_seats(bundles: list[tuple[Any, list[Contestant]]], plans: list[Plan], seed: int) -> list[Seat]:
-    """Reset the actors, grouped ones as one actor."""
+def assign_slots(bundles: list[tuple[Any, list[Contestant]]], plans: list[Plan], seed: int) -> list[ActorSlots]:
+    """Reset the actors for their slots, agents as an `AgentGroup`."""
     by_name = {plan.contestant.name: plan for plan in plans}
-    seats, low = [], 0
+    assigned, low = [], 0
     for _, members in bundles:
         sizes = [len(by_name[member.name].slots) for member in members]
         seeds = [_actor_seed(seed, member.name) for member in members]
         actor = members[0].actor
-        if len(members) > 1:
+        if hasattr(actor, "group_key"):
             actor = AgentGroup([member.actor for member in members])
             actor.reset(sizes, seeds)
         else:
             actor.reset(sizes[0], seeds[0])
-        seats.append(Seat(" + ".join(member.name for member in members), actor, low, low + sum(sizes)))
-        low = seats[-1].high
-    return seats
+        high = low + sum(sizes)
+        assigned.append(ActorSlots(" + ".join(member.name for member in members), actor, low, high))
+        low = high
+    return assigned
 
 
 def _actor_seed(seed: int, name: str) -> int:
@@ -113,7 +114,7 @@ def _actor_seed(seed: int, name: str) -> int:
 
 
 def episode_seeds(contestant: Contestant, seed: int) -> list[int]:
-    """Seed of each episode: the i-th of every label has the same."""
+    """Return the seed of each episode: the i-th of every label has the same."""
     counts: Counter[str] = Counter()
     seeds = []
     for episode in range(contestant.episodes):

@@ -1,4 +1,8 @@
-"""Files and folders written whole or not at all."""
+"""Files and folders written completely or not at all.
+
+The libraries for atomic files cover a single file only, without folders, stale leftovers of killed processes and a
+message that tells the user what a full or read-only disk means.
+"""
 
 from __future__ import annotations
 
@@ -18,19 +22,19 @@ from dds_lightning._version import __version__
 from dds_lightning.errors import UserError
 
 STALE_AFTER = 3600.0
-"""Seconds after which an unfinished file belongs to nobody."""
+"""Seconds after which an unfinished file is taken for a leftover."""
 DISK_ERRORS = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO),  # full or failing
-    *(errno.EROFS, errno.EACCES, errno.EPERM),  # not ours to write
+    *(errno.EROFS, errno.EACCES, errno.EPERM),  # no permission to write
     *(errno.ENOTDIR, errno.EISDIR),  # a path that leads elsewhere
 )
-"""What a disk says that the user can mend."""
+"""Errors of a disk that the user can fix."""
 
 
 def beside(path: Path) -> Path:
-    """A hidden name next to `path` that nobody else uses, for what is not finished yet.
+    """Return a unique hidden name next to `path`, for what is not finished yet.
 
-    What a kill left under such a name more than an hour ago is removed.
+    Leftovers of a killed process, more than an hour old, are removed.
     """
     for left in path.parent.glob(f".{glob.escape(path.name)}.{'?' * 8}.part"):
         with contextlib.suppress(OSError):
@@ -42,10 +46,10 @@ def beside(path: Path) -> Path:
 
 @contextlib.contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
-    """Write to the path this yields; when the block ends well it is synced and takes the place of `path`.
+    """Yield a path to write to; if the block succeeds, it is synced and replaces `path`.
 
     Raises:
-        OSError: it could not be written; what was at `path` is still there.
+        OSError: It could not be written; what was at `path` is still there.
     """
     with _errors_name(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -61,13 +65,13 @@ def written_whole(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def folder_written_whole(folder: Path) -> Iterator[Path]:
-    """Fill the folder this yields; when the block ends well it is synced and takes the place of `folder`.
+    """Yield a folder to fill; if the block succeeds, it is synced and replaces `folder`.
 
-    No system call exchanges two folders everywhere, so for a moment neither has the name: whoever reads calls
-    `mend_folder` first.
+    No portable system call exchanges two folders, so for a moment neither has the name: readers call `mend_folder`
+    first.
 
     Raises:
-        OSError: it could not be written; what was at `folder` is still there.
+        OSError: It could not be written; what was at `folder` is still there.
     """
     with _errors_name(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -88,7 +92,7 @@ def folder_written_whole(folder: Path) -> Iterator[Path]:
 
 
 def mend_folder(folder: Path) -> None:
-    """After a stop while `folder` was replaced: the previous one comes back, or goes if the new one is in place."""
+    """Finish an interrupted replacement of `folder`: restore the previous one, or delete it if a new one exists."""
     previous = _previous(folder)
     if previous.is_dir():
         if folder.exists():
@@ -103,21 +107,21 @@ def _previous(folder: Path) -> Path:
 
 @contextlib.contextmanager
 def _errors_name(path: Path) -> Iterator[None]:
-    """Let an error of the disk say what it kept from being written; its kind and number stay."""
+    """Add to a disk error what could not be written; its type and number stay."""
     try:
         yield
     except OSError as error:
-        number = errno.EIO if error.errno is None else error.errno  # NumPy tells of a short write without one
+        number = errno.EIO if error.errno is None else error.errno  # NumPy reports a short write without one
         if number not in DISK_ERRORS:
             raise
-        told = f"{path} could not be written ({error.strerror or error}); what was there before is untouched"
-        raise OSError(number, told) from error
+        message = f"{path} could not be written ({error.strerror or error}); what was there before is untouched"
+        raise OSError(number, message) from error
 
 
 def sync(path: Path) -> None:
     """Flush a file or a directory to the disk."""
     if os.name == "nt" and path.is_dir():
-        return  # Windows opens no directory
+        return  # Windows cannot open a directory
     handle = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -126,29 +130,29 @@ def sync(path: Path) -> None:
 
 
 def sha256(path: Path) -> str:
-    """Hash of a file, in hexadecimal."""
+    """Return the hash of a file in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def short(digest: str) -> str:
-    """The beginning of a hash, as people compare it."""
+    """Return the beginning of a hash, enough for people to compare."""
     return digest[:8]
 
 
 def refuse_newer(what: str | Path, found: Any, known: int) -> None:
-    """Refuse what a later version of this package wrote.
+    """Refuse what a newer version of this package wrote.
 
     Args:
-        what: the file or directory.
-        found: the version of its format.
-        known: the latest version that is understood here.
+        what: The file or directory.
+        found: The version of its format.
+        known: The latest version that is understood here.
 
     Raises:
-        UserError: it is newer, or no version.
+        UserError: It is newer, or not a version number.
     """
     if not isinstance(found, int) or found < 1:
-        raise UserError(f"{what}: format_version is {found!r}, expected a number from 1 on")
+        raise UserError(f"{what}: format_version is {found!r}, expected a whole number of at least 1")
     if found > known:
         raise UserError(
             f"{what} has format {found}, but this version of dds-lightning ({__version__}) reads up to "
@@ -157,7 +161,7 @@ def refuse_newer(what: str | Path, found: Any, known: int) -> None:
 
 
 def neighbours(path: Path) -> str:
-    """What lies where `path` was expected, as the end of a message."""
+    """Return what is in the folder where `path` was expected, as the end of a message."""
     folder = path.parent
     if not folder.is_dir():
         return f": the folder {folder} does not exist either"

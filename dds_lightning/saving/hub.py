@@ -1,4 +1,4 @@
-"""Published directories on the Hugging Face hub: `hf:OWNER/NAME` wherever a directory is read or written.
+"""Published directories on the Hugging Face Hub: `hf:OWNER/NAME` wherever a directory is read or written.
 
 Only the five files of a published directory travel, and what arrives is verified like any other directory.
 """
@@ -16,54 +16,54 @@ PREFIX = "hf:"
 
 
 def is_hub(place: str | Path) -> bool:
-    """Whether a place is on the hub."""
+    """Whether an address is on the Hub."""
     return str(place).startswith(PREFIX)
 
 
 def pull(place: str, token: str | None = None) -> Path:
-    """Fetch a published directory, or find it in the hub's own cache.
+    """Fetch a published directory, or find it in the Hub's cache.
 
     Args:
-        place: `hf:OWNER/NAME` or `hf:OWNER/NAME@REVISION`; pin a revision to get the same agent for ever.
-        token: for private repositories; None takes the one of `hf auth login`.
+        place: `hf:OWNER/NAME` or `hf:OWNER/NAME@REVISION`; pin a revision to always get the same agent.
+        token: For private repositories; the one of `hf auth login` by default.
 
     Returns:
         The local directory, verified.
 
     Raises:
-        UserError: the extra is missing, the name is none, the hub cannot be reached, or the directory is not sound.
+        UserError: The extra is missing, the address is not valid, the Hub cannot be reached, or a file is damaged.
     """
     repo, revision = _parse(place)
     hub = _hub()
     try:
         folder = hub.snapshot_download(repo, revision=revision, token=token, allow_patterns=[*CONTENTS, SUMS])
-    except Exception as error:  # the hub's client raises its own, its HTTP library's and OSErrors
+    except Exception as error:  # the client raises its own errors, its HTTP library's and OSErrors
         raise UserError(f"{place} could not be fetched: {_first_line(error)}") from error
     load_published(folder)
     return Path(folder)
 
 
 def push(directory: str | Path, place: str, token: str | None = None, private: bool = True) -> str:
-    """Upload a published directory; it is verified before.
+    """Upload a published directory after verifying it.
 
     Args:
-        directory: as published.
+        directory: As published.
         place: `hf:OWNER/NAME`.
-        token: None takes the one of `hf auth login`.
-        private: of a repository that does not exist yet.
+        token: the one of `hf auth login` by default.
+        private: Whether a repository that does not exist yet becomes private.
 
     Returns:
         Address of the upload.
 
     Raises:
-        UserError: as `pull`.
+        UserError: As `pull`.
     """
     repo, revision = _parse(place)
     load_published(directory)
     hub = _hub()
     try:
         hub.create_repo(repo, private=private, exist_ok=True, token=token)
-        made = hub.upload_folder(
+        address = hub.upload_folder(
             repo_id=repo,
             folder_path=str(directory),
             revision=revision,
@@ -73,13 +73,13 @@ def push(directory: str | Path, place: str, token: str | None = None, private: b
         )
     except Exception as error:
         raise UserError(f"{directory} could not be pushed to {place}: {_first_line(error)}") from error
-    return str(made)
+    return str(address)
 
 
 def _parse(place: str) -> tuple[str, str | None]:
     match = re.fullmatch(r"hf:([\w.-]+/[\w.-]+)(?:@([\w./-]+))?", str(place))
     if match is None or ".." in place:
-        raise UserError(f"'{place}' is no place on the hub, expected hf:OWNER/NAME or hf:OWNER/NAME@REVISION")
+        raise UserError(f"'{place}' is not a Hub address, expected hf:OWNER/NAME or hf:OWNER/NAME@REVISION")
     return match[1], match[2]
 
 

@@ -48,10 +48,10 @@ class Published:
     """A published directory in memory, verified.
 
     Attributes:
-        directory: where it was read.
-        state: all weights, keys "skill.*" and "policy.*".
-        config: config.yaml.
-        metrics: metrics.json.
+        directory: Where it was read.
+        state: All weights, keys "skill.*" and "policy.*".
+        config: Contents of config.yaml.
+        metrics: Contents of metrics.json.
     """
 
     directory: Path
@@ -63,7 +63,7 @@ class Published:
         """Build module `part`, in evaluation mode on the CPU.
 
         Raises:
-            UserError: it is not there, or its weights do not fit its settings.
+            UserError: The module is missing, or its weights do not fit its settings.
         """
         if not isinstance(self.config.get(part), dict):
             raise UserError(f"{self.directory / CONFIG} describes no '{part}'; it has {', '.join(self.config)}")
@@ -81,18 +81,18 @@ def publish(
     """Write a published directory: whole, or the previous one stays.
 
     Args:
-        directory: where; an earlier published directory there is replaced.
+        directory: Where to write; an earlier published directory there is replaced.
         modules: Lightning modules by the name they get, for example "skill" and "policy".
-        config: further plain values for config.yaml, for example the task.
-        metrics: scores, plain values.
-        card: README.md; a short one is written without it.
+        config: Further plain values for config.yaml, for example the task.
+        metrics: Scores as plain values.
+        card: Text of README.md; a short one by default.
 
     Returns:
         The directory.
 
     Raises:
-        UserError: something else is at `directory`, or a value cannot be written plainly.
-        OSError: it could not be written.
+        UserError: Something else is at `directory`, or a value is not plain.
+        OSError: It could not be written.
     """
     target = Path(directory).expanduser().resolve()
     mend_folder(target)
@@ -113,7 +113,7 @@ def publish(
     with folder_written_whole(target) as part:
         try:
             safetensors.torch.save_file(state, part / WEIGHTS, metadata={"format": "pt"})
-        except safetensors.SafetensorError as error:  # its word for an error of the disk
+        except safetensors.SafetensorError as error:  # what it raises for a disk error
             raise UserError(f"{target / WEIGHTS} could not be written: {error}") from None
         (part / WEIGHTS).chmod(0o644)  # safetensors writes for the owner alone
         for name, text in texts.items():
@@ -128,7 +128,7 @@ def load_published(directory: str | os.PathLike[str]) -> Published:
     """Read and verify a published directory.
 
     Raises:
-        UserError: a file is missing, changed, damaged, or of a newer version; the message names it.
+        UserError: A file is missing, changed, damaged, or of a newer version; the message names it.
     """
     directory = Path(directory).expanduser()
     with contextlib.suppress(OSError):
@@ -139,7 +139,7 @@ def load_published(directory: str | os.PathLike[str]) -> Published:
     lacking = [name for name in (*CONTENTS, SUMS) if not (directory / name).is_file()]
     if lacking:
         raise UserError(
-            f"{directory} is no published checkpoint: it lacks {', '.join(lacking)}; "
+            f"{directory} is not a published checkpoint: it lacks {', '.join(lacking)}; "
             f"it holds {', '.join(there) or 'nothing'}"
         )
     _verify_sums(directory)
@@ -157,13 +157,13 @@ def _verify_sums(directory: Path) -> None:
     for line in (directory / SUMS).read_text(encoding="utf-8", errors="replace").splitlines():
         digest, _, name = line.partition("  ")
         if name not in CONTENTS or len(digest) != 64:
-            raise UserError(f"{directory / SUMS}: '{line[:80]}' is no line of it, expected a hash and a file name")
+            raise UserError(f"{directory / SUMS}: '{line[:80]}' is not a valid line, expected a hash and a file name")
         sums[name] = digest
     for name in CONTENTS:
         if sums.get(name) != sha256(directory / name):
             raise UserError(
                 f"{directory / name} is not the file that was published (its hash differs from {SUMS}): "
-                "fetch the directory again; after a change of your own, write the sums anew with `sha256sum`"
+                "fetch the directory again; if you changed it yourself, update the sums with `sha256sum`"
             )
 
 
@@ -178,7 +178,7 @@ def _read(path: Path, parse: Callable[[str], Any]) -> dict[str, Any]:
 
 
 def _refuse_foreign(target: Path) -> None:
-    """Replace only what was published: a wrong path must not cost anybody their files."""
+    """Replace only what was published: a wrong path must not destroy other files."""
     if not target.exists():
         return
     if not target.is_dir():
@@ -191,7 +191,7 @@ def _refuse_foreign(target: Path) -> None:
 
 
 def _plain(value: Any, where: str) -> Any:
-    """The value with tuples as lists; refuse what YAML and JSON cannot hold plainly."""
+    """Return the value with tuples as lists; refuse what YAML and JSON cannot hold as plain values."""
     if value is None or type(value) in (bool, int, float, str):
         return value
     if isinstance(value, Mapping):
@@ -214,20 +214,20 @@ def _short_card(name: str, config: Mapping[str, Any]) -> str:
 
 
 def build_module(cls: type[M], settings: Mapping[str, Any], state: Mapping[str, Tensor], origin: str) -> M:
-    """Build a module and fill it; every misfit names the file."""
-    # Lightning's command line leaves `_instantiator` and the like, names of code to call: never followed.
+    """Build a module and load its weights; errors name the file."""
+    # Lightning's command line stores `_instantiator` and the like, names of code to call: they are never followed.
     settings = {key: value for key, value in settings.items() if not str(key).startswith("_")}
     try:
-        with torch.device("meta"):  # takes no memory, whatever widths a file may name
+        with torch.device("meta"):  # takes no memory, whatever widths a file names
             own = {name: value.shape for name, value in cls(**settings).state_dict().items()}
     except TypeError as error:
         reason = str(error).replace("__init__()", "it").replace(f"{cls.__name__}.", "")
-        raise UserError(f"{origin} holds no {cls.__name__} of this version: {reason}") from None
+        raise UserError(f"{origin} does not hold a {cls.__name__} of this version: {reason}") from None
     except UserError as error:
         raise UserError(f"{origin}: {error}") from None
     except (RuntimeError, ValueError, ArithmeticError, AssertionError) as error:
         reason = str(error).split("\n", 1)[0]
-        raise UserError(f"{origin} holds settings of which no {cls.__name__} can be built: {reason}") from None
+        raise UserError(f"{origin} holds settings with which no {cls.__name__} can be built: {reason}") from None
     missing, unknown = sorted(own.keys() - state.keys()), sorted(state.keys() - own.keys())
     if missing or unknown:
         lists = ((what, names) for what, names in (("lacks", missing), ("has unknown", unknown)) if names)

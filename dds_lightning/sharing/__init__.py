@@ -1,1 +1,1 @@
-"""An agent for others: exported to one file, verified."""
+"""Sharing an agent: export to one file, verification of a published directory."""

@@ -6,7 +6,7 @@
  noise (N, B, A) ─────┴─► normaliser ─► codebook, decoder ─► actions (B, A)
 ```
 
-The file is a function: whoever calls it keeps the clock (code -1 every `horizon` steps, else the code that came
+The file is a function: its caller keeps the clock (code -1 every `horizon` steps, else the code that came
 out) and draws the noise. `gumbel` of zeros takes the likeliest code; standard Gumbel noise samples from the policy.
 """
 
@@ -45,10 +45,10 @@ class ActingGraph(nn.Module):
     """What an exported file computes; see the module's picture.
 
     Args:
-        agent: with selection `sample`, `greedy` or `argmax_q`.
+        agent: With selection `sample`, `greedy` or `argmax_q`.
 
     Raises:
-        UserError: the agent chooses skills in a way that needs no policy.
+        UserError: The agent chooses its skills without a policy.
     """
 
     def __init__(self, agent: DDSAgent) -> None:
@@ -60,8 +60,7 @@ class ActingGraph(nn.Module):
             )
         self.skill, self.policy = agent.skill, agent.policy
         self.by_q, self.temperature = agent.selection == "argmax_q", agent.temperature
-        scale = agent.skill.hparams["noise_scale"] if agent.noise_scale is None else agent.noise_scale
-        self.noise_scale = float(scale)
+        self.noise_scale = agent.noise_scale
         self.eval()
 
     def forward(self, observations: Tensor, codes: Tensor, gumbel: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
@@ -85,7 +84,7 @@ class ActingGraph(nn.Module):
 
 
 def describe(agent: DDSAgent, task: str | None = None) -> dict[str, Any]:
-    """The facts that a caller of an exported file needs; they lie in the file as JSON."""
+    """Return what a caller of an exported file needs to know; the file holds it as JSON."""
     graph = ActingGraph(agent)
     return {
         "task": task,
@@ -104,16 +103,16 @@ def export_agent(agent: DDSAgent, path: str | Path, format: Format = "onnx", *, 
     """Write an agent as one file, whole or not at all.
 
     Args:
-        agent: as `DDSAgent.load` gives it.
-        path: the file.
+        agent: As `DDSAgent.load` gives it.
+        path: The file.
         format: `onnx`, or `torch` for `torch.export.load` (a program, no pickled classes).
-        task: kept among the facts.
+        task: Name of the task to store in the file.
 
     Returns:
         The file.
 
     Raises:
-        UserError: the agent needs no policy, the format is unknown, or a package for it is missing.
+        UserError: The agent chooses its skills without a policy, the format is unknown, or a package for it is missing.
     """
     if format not in SUFFIXES:
         raise UserError(f"format is '{format}', expected one of {', '.join(SUFFIXES)}")
@@ -130,7 +129,7 @@ def export_agent(agent: DDSAgent, path: str | Path, format: Format = "onnx", *, 
             program = torch.export.export(graph, example, dynamic_shapes=shapes)
             torch.export.save(program, part, extra_files={FACTS: facts})
         else:
-            made = torch.onnx.export(
+            exported = torch.onnx.export(
                 graph,
                 example,
                 input_names=list(INPUTS),
@@ -139,14 +138,14 @@ def export_agent(agent: DDSAgent, path: str | Path, format: Format = "onnx", *, 
                 dynamo=True,
                 external_data=False,
             )
-            assert made is not None, "the dynamo exporter returns a program"
-            made.model.metadata_props[FACTS] = facts
-            made.save(part, external_data=False)
+            assert exported is not None, "the dynamo exporter returns a program"
+            exported.model.metadata_props[FACTS] = facts
+            exported.save(part, external_data=False)
     return path
 
 
 def example_inputs(agent: DDSAgent, batch: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Inputs of the right shapes, with random noise and every code due."""
+    """Return inputs of the right shapes, with random noise and every code due."""
     stream = torch.Generator().manual_seed(seed)
     return (
         torch.randn(batch, agent.observation_dim, generator=stream),
@@ -160,7 +159,7 @@ def load_exported(path: str | Path) -> tuple[Callable[..., tuple[NDArray[Any], .
     """Open an exported file as a function of NumPy arrays, and its facts.
 
     Raises:
-        UserError: there is no such file, it is damaged, or a package for it is missing.
+        UserError: There is no such file, it is damaged, or a package for it is missing.
     """
     path = Path(path)
     if not path.is_file():
@@ -170,7 +169,7 @@ def load_exported(path: str | Path) -> tuple[Callable[..., tuple[NDArray[Any], .
     except UserError:
         raise
     except Exception as error:  # neither format promises which errors a damaged file raises
-        raise UserError(f"{path} is no exported agent, or damaged: {str(error).splitlines()[0]}") from error
+        raise UserError(f"{path} is not an exported agent, or damaged: {str(error).splitlines()[0]}") from error
 
 
 def _load_onnx(path: Path) -> tuple[Callable[..., Any], dict[str, Any]]:
@@ -201,7 +200,7 @@ def _load_torch(path: Path) -> tuple[Callable[..., Any], dict[str, Any]]:
 
 
 def latency(call: Callable[..., Any], arrays: tuple[NDArray[Any], ...], calls: int = 200) -> dict[str, float]:
-    """Milliseconds of one call: `median` and `p95`, after ten calls that do not count."""
+    """Return milliseconds of one call, `median` and `p95`, after ten warm-up calls."""
     times = []
     for number in range(10 + calls):
         start = time.perf_counter()
@@ -219,7 +218,7 @@ def check_exported(agent: DDSAgent, path: str | Path) -> dict[str, Any]:
         `difference` (largest, of actions for fixed noise), `file_ms` and `agent_ms` (see `latency`).
 
     Raises:
-        UserError: the file does something else than the agent (codes differ, or actions by more than 1e-5).
+        UserError: The file does not act like the agent (codes differ, or actions differ by more than 1e-5).
     """
     call, _ = load_exported(path)
     graph = ActingGraph(agent)
@@ -228,10 +227,10 @@ def check_exported(agent: DDSAgent, path: str | Path) -> dict[str, Any]:
         inputs = example_inputs(agent, batch, seed=batch)
         with torch.inference_mode():
             actions, codes = (output.numpy() for output in graph(*inputs))
-        found = call(*(tensor.numpy() for tensor in inputs))
-        if not np.array_equal(found[1], codes):
+        answer = call(*(tensor.numpy() for tensor in inputs))
+        if not np.array_equal(answer[1], codes):
             raise UserError(f"{path} chooses other codes than the agent: export it again")
-        difference = max(difference, float(np.abs(found[0] - actions).max()))
+        difference = max(difference, float(np.abs(answer[0] - actions).max()))
     if difference > 1e-5:
         raise UserError(f"{path}: actions differ from the agent's by {difference:g}, expected at most 1e-5")
     arrays = tuple(tensor.numpy() for tensor in example_inputs(agent, 1))
@@ -251,7 +250,7 @@ def _need(*packages: str) -> None:
 
 @contextlib.contextmanager
 def _quietly() -> Iterator[None]:
-    """Exporters print notes for their own developers."""
+    """Silence the exporters, which print notes for their developers."""
     noisy = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "torch.export", "onnx_ir")]
     levels = [logger.level for logger in noisy]
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():

@@ -1,4 +1,4 @@
-"""Is a published directory what it says it is? Everything that `dds checkpoints verify` looks at."""
+"""Whether a published directory is what it claims to be: all checks of `dds checkpoints verify`."""
 
 from __future__ import annotations
 
@@ -11,41 +11,54 @@ import pandas as pd
 
 from dds_lightning.agent import DDSAgent
 from dds_lightning.errors import UserError
-from dds_lightning.saving.published import SUMS, load_published
+from dds_lightning.saving.published import SUMS, Published, load_published
+from dds_lightning.training.stages import STAGES, Stage
 
 TOLERANCE = 1e-3
-"""Between the answers stored and given: processors and library versions round differently, weights that differ do
-more."""
+"""Largest difference between stored and computed answers: processors and library versions round differently, but other
+weights differ by more."""
 
 
 def verify_published(directory: str | Path) -> dict[str, Any]:
-    """Look at everything: file hashes, header, shapes, finite numbers, and the answers to fixed questions.
+    """Check everything: file hashes, header, shapes, finite numbers, and the answers to fixed questions.
 
     Args:
-        directory: as published.
+        directory: The published directory.
 
     Returns:
-        Facts: `task`, `parameters`, `horizon`, `num_skills`, `golden` (largest difference from the stored answers;
-        None for a directory that stores none).
+        Facts: `task`, `stages` (of its modules), `parameters`, `horizon` and `num_skills` (None without an agent),
+        `golden` (largest difference from the stored answers; None for a directory that stores none).
 
     Raises:
-        UserError: at the first thing wrong; the message names the file.
+        UserError: A check fails; the message names the file.
     """
     published = load_published(directory)
-    agent = DDSAgent.load(directory)
+    modules = {name: published.module(stage.module_class(), name) for name, stage in _stages(published)}
+    if not modules:
+        raise UserError(f"{directory} holds no module of a training stage, expected some of {', '.join(STAGES)}")
     facts: dict[str, Any] = {
         "directory": str(directory),
         "task": published.config.get("task"),
+        "stages": list(modules),
         "format": published.config["format_version"],
-        "parameters": sum(parameter.numel() for parameter in agent.parameters()),
-        "horizon": agent.horizon,
-        "num_skills": agent.num_skills,
+        "parameters": sum(value.numel() for module in modules.values() for value in module.parameters()),
+        "horizon": None,
+        "num_skills": None,
         "golden": None,
     }
+    if "skill" not in modules:
+        return facts
+    agent = DDSAgent.load(directory)
+    facts |= {"horizon": agent.horizon, "num_skills": agent.num_skills}
     stored = published.config.get("golden")
     if stored is not None:
         facts["golden"] = _compare(directory, stored, agent.golden())
     return facts
+
+
+def _stages(published: Published) -> list[tuple[str, Stage]]:
+    """The registered training stages whose modules a directory holds."""
+    return [(name, stage) for name, stage in STAGES.items() if isinstance(published.config.get(name), dict)]
 
 
 def _compare(directory: str | Path, stored: Any, given: dict[str, Any]) -> float:
@@ -54,11 +67,11 @@ def _compare(directory: str | Path, stored: Any, given: dict[str, Any]) -> float
         try:
             expected = np.array(stored[name], dtype=np.float64)
         except (KeyError, TypeError, ValueError) as error:
-            raise UserError(f"{directory}: golden, {name}: found no table of numbers ({error!r})") from error
+            raise UserError(f"{directory}: golden, {name}: expected a table of numbers ({error!r})") from error
         if expected.shape != np.shape(answer):
             raise UserError(
                 f"{directory}: golden, {name}: found shape {expected.shape}, expected {np.shape(answer)}; the "
-                "directory's files are not of one agent"
+                "directory's files belong to different agents"
             )
         difference = float(np.abs(expected - np.array(answer)).max())
         if not difference <= TOLERANCE:
@@ -72,7 +85,7 @@ def _compare(directory: str | Path, stored: Any, given: dict[str, Any]) -> float
 
 
 def find_published(roots: Iterable[str | Path] = ("checkpoints", "runs")) -> pd.DataFrame:
-    """Published directories under some folders, without reading their weights.
+    """List published directories under some folders, without reading their weights.
 
     Returns:
         One row a directory: `checkpoint`, `task`, `score` (of the first contestant in metrics.json), `success`,

@@ -1,1 +1,1 @@
-"""What the method is measured against, and how the measurement is told."""
+"""What the method is measured against, and how the measurements are reported."""

@@ -1,4 +1,4 @@
-"""The card of a published agent: what it does, how well, and how it was made, for whoever finds the directory."""
+"""The card of a published agent: what it does, how well, and how it was trained."""
 
 import textwrap
 from collections.abc import Mapping
@@ -27,13 +27,13 @@ def agent_card(
     """Write the card.
 
     Args:
-        task: where the agent acts.
-        episodes: the rollout's table; its first contestant is how the agent acts by default.
-        seed: of training and evaluation.
-        data: facts about the data, name to value; "source" is where they come from, as `--data` takes it, or a
-            sentence that begins with "collected" where they were made for this agent.
+        task: Where the agent acts.
+        episodes: The rollout's table; its first contestant is how the agent acts by default.
+        seed: Seed of training and evaluation.
+        data: Facts about the data, name to value; "source" is where they come from, as `--data` takes it, or a
+            sentence that begins with "collected" if they were collected for this agent.
         settings: "skill" and "policy" to the parsed settings of their training.
-        command: what makes the same agent again.
+        command: The command that trains the same agent again.
     """
     table = summary_table(episodes)
     table = table[table["kind"] == CONTESTANT]
@@ -75,11 +75,11 @@ action = agent.act(observation)  # a skill every {settings["skill"]["data"]["hor
 
 
 def with_diagnosis(card: str, run: Path) -> str:
-    """The card with the section that says which stage loses, before the data.
+    """Insert the section on where the run loses into a card, before the data.
 
     Args:
-        card: as `agent_card` wrote it.
-        run: the run directory, its report included.
+        card: As `agent_card` wrote it.
+        run: The run directory, its report included.
     """
     measured = {stage: run / "report" / f"{stage}_metrics.csv" for stage in ("skill", "policy")}
     logs = {stage: path for stage, path in measured.items() if path.is_file()}
@@ -105,7 +105,7 @@ def _paper(task: Task) -> str:
 
 
 def _limits(task: Task) -> str:
-    """What the agent was never taught."""
+    """Return what the agent was never trained for."""
     if task.maze_map is not None:
         return (
             "It knows one maze, one start and one goal: another goal needs a policy of its own (the skills can be used "
@@ -123,10 +123,9 @@ def _limits(task: Task) -> str:
 
 
 def _provenance(source: str, task: Task) -> str:
-    """Whose data they were, and what its scores may therefore be compared with."""
+    """Return where the data came from, and what the scores may be compared with."""
     if source.startswith("collected"):
-        who = "a scripted controller" if task.family == "pointmaze" else "controllers"
-        return f"The data were made by {who} of this project; scores are not comparable with those on D4RL's data sets."
+        return "The data come from this project's controllers: scores are not comparable with those on D4RL's own data."
     if source.startswith("d4rl:"):
         return (
             f"The data are a file in D4RL's layout ({source}): compare scores only with others on that same file, and "

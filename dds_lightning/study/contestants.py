@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dds_lightning.errors import UserError
-from dds_lightning.rollout.actors import Contestant, EveryRow, single_skills
+from dds_lightning.rollout.actors import Contestant, single_skills
 from dds_lightning.tasks import Task
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ COOL = 0.5
 
 
 def way_name(selection: str, temperature: float = 1.0) -> str:
-    """What the table calls a way of choosing skills."""
+    """Return the table's name for a way of choosing skills."""
     if selection == "sample":
         return "AWR policy, sampled" + ("" if temperature == 1.0 else f" at temperature {temperature:g}")
     names = {"greedy": "AWR policy, greedy", "argmax_q": "argmax-Q", "random": "random skills"}
@@ -32,23 +32,23 @@ def way(
     """One way of choosing skills as a contestant.
 
     Args:
-        agent: whose skills and policy.
-        selection: as in `DDSAgent`.
-        episodes: how many it plays.
-        temperature: of `sample`.
-        best: facts of the checkpoint (see `protocol.best_facts`), if it is not the last one; its name says so.
+        agent: The agent whose skills and policy play.
+        selection: As in `DDSAgent`.
+        episodes: How many it plays.
+        temperature: Temperature of `sample`.
+        best: Facts of the checkpoint (see `protocol.best_facts`), if it is not the last one; its name says so.
     """
-    name = way_name(selection, temperature) + (f" ({best_words(best)})" if best else "")
+    name = way_name(selection, temperature) + (f" ({best_label(best)})" if best else "")
     return Contestant(name, agent.variant(selection, temperature=temperature), episodes)  # type: ignore[arg-type]
 
 
 def best_ways(agent: "DDSAgent", episodes: int, facts: Mapping[str, Any]) -> list[Contestant]:
-    """The best checkpoint's policy, sampled and greedy; `facts` as in `way`."""
+    """Return the best checkpoint's policy, sampled and greedy; `facts` as in `way`."""
     return [way(agent, selection, episodes, best=facts) for selection in ("sample", "greedy")]
 
 
-def best_words(best: Mapping[str, Any]) -> str:
-    """How a checkpoint was chosen that is not the last one, and what that does to its score."""
+def best_label(best: Mapping[str, Any]) -> str:
+    """Say how a checkpoint other than the last was chosen, and what that does to its score."""
     if not str(best["monitor"]).startswith("rollout/"):
         return f"best {best['monitor']} while training, step {best['step']:,}"
     return f"best of {best['evaluations']} evaluations while training, step {best['step']:,}: optimistic"
@@ -63,16 +63,16 @@ def final_table(
     controller: Any = None,
     best: Sequence[Contestant] = (),
 ) -> list[Contestant]:
-    """Everyone in the table at the end of `dds run`.
+    """Return all contestants of the table at the end of `dds run`.
 
     Args:
-        agent: the trained agent; its own selection and temperature are the table's first row.
-        task: where they play.
-        episodes: for each contestant.
-        episodes_per_skill: for each single skill alone.
-        clone: actor of the behaviour-cloning baseline, if there is one.
-        controller: actor that made the data, if there is one.
-        best: ways of choosing of the best checkpoint, if one was kept.
+        agent: The trained agent; its selection and temperature make the table's first row.
+        task: Where they play.
+        episodes: Episodes of each contestant.
+        episodes_per_skill: Episodes of each single skill alone.
+        clone: Actor of the behaviour-cloning baseline, if there is one.
+        controller: Actor that collected the data, if there is one.
+        best: Ways of choosing of the best checkpoint, if one was kept.
     """
     ways = [
         (agent.selection, agent.temperature),
@@ -91,36 +91,21 @@ def final_table(
 
 
 def behaviour_controller(task: Task) -> Any:
-    """The actor that made a collected set, with the noise that it had there; None where there is none."""
-    if task.family == "pointmaze":
-        from datamodules.collect.behaviour import BehaviourNoise
-        from datamodules.collect.pointmaze import WaypointController
+    """The actor that made a collected set, with the noise that it had there; None if there is no collector."""
+    from datamodules.collect.collectors import behaviour_actor
 
-        return EveryRow(WaypointController(task, BehaviourNoise()))
-    if task.family == "antmaze" and task.physics == "d4rl":
-        from datamodules.collect.antmaze import AntMazeRecipe, AntNavigator
-
-        return EveryRow(AntNavigator(task, AntMazeRecipe()))
-    if task.family == "kitchen":
-        from datamodules.collect.kitchen import KitchenDemonstrator, KitchenRecipe
-
-        return EveryRow(KitchenDemonstrator(task, KitchenRecipe()))
-    if task.family == "locomotion":
-        from datamodules.collect.locomotion import Runners
-
-        return EveryRow(Runners(task))
-    return None
+    return behaviour_actor(task)
 
 
 BEST_AGENT = Path("evaluate", "best")
-"""Where a run publishes its best checkpoint, if it kept one; the last is in `agent`."""
+"""Where a run publishes its best checkpoint, if it kept one; the last one is in `agent`."""
 
 
 def agent_directory(directory: Path) -> Path:
-    """The published agent of a run directory, or the directory itself if it is a published one.
+    """Return the published agent of a run directory, or the directory itself if it is a published one.
 
     Raises:
-        UserError: it is neither.
+        UserError: The directory is neither.
     """
     if not directory.is_dir():
         raise UserError(f"there is no folder {directory}: give a run of `dds run` or a published checkpoint")
@@ -135,6 +120,6 @@ def agent_directory(directory: Path) -> Path:
 
 
 def best_directory(directory: Path) -> Path | None:
-    """The published best checkpoint of a run directory, if it kept one."""
-    found = directory / BEST_AGENT
-    return found if (found / "model.safetensors").is_file() else None
+    """Return the published best checkpoint of a run directory, if it kept one."""
+    best = directory / BEST_AGENT
+    return best if (best / "model.safetensors").is_file() else None

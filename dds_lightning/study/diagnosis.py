@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 
 def behaviour_scores(trajectories: Trajectories, task: Task) -> dict[str, float]:
-    """How well the behaviour policy did, as an evaluation would score it.
+    """Score the behaviour policy as an evaluation would.
 
     In the kitchen the data's rewards count at every step, an evaluation only once: there the subtasks that an
-    episode gets done are counted.
+    episode completes are counted.
 
     Returns:
         `mean` and `best` normalised score of an episode.
@@ -42,26 +42,28 @@ def behaviour_scores(trajectories: Trajectories, task: Task) -> dict[str, float]
     return {"mean": round(float(scores.mean()), 2), "best": round(float(scores.max()), 2)}
 
 
-def diagnose(found: Findings, logs: Mapping[str, Path]) -> dict[str, pd.DataFrame]:
-    """The small tables of the report's section on where the run loses; what nobody measured is left out.
+def diagnose(findings: Findings, logs: Mapping[str, Path]) -> dict[str, pd.DataFrame]:
+    """Return the small tables of the report's section on where the run loses; what was not measured is left out.
 
     Args:
-        found: what the run found.
+        findings: What the run produced.
         logs: "skill" and "policy" to the metrics.csv of their training.
 
     Returns:
-        `scores`: one row a step from data to policy, columns `who` and `score` (normalised); `measures`: columns
+        `scores`: one row per step from data to policy, columns `who` and `score` (normalised); `measures`: columns
         `measure` and `value`, numbers of the two trainings and of the critic at the start.
     """
-    return {"scores": _scores(found), "measures": _measures(found, logs)}
+    return {"scores": _scores(findings), "measures": _measures(findings, logs)}
 
 
-def _scores(found: Findings) -> pd.DataFrame:
-    data = found.facts("data").get("scores", {})
+def _scores(findings: Findings) -> pd.DataFrame:
+    data = findings.facts("data").get("scores", {})
     rows = [(f"the data, {which} episode", data[which]) for which in ("mean", "best") if which in data]
-    summary = found.summary
-    chosen = summary["contestant"].isin(["behaviour cloning", "random skills", found.main]) | (summary["kind"] == BEST)
-    ladder = {"behaviour cloning": 0, "random skills": 1, found.main: 3}  # the best single skill between them
+    summary = findings.summary
+    chosen = summary["contestant"].isin(["behaviour cloning", "random skills", findings.main]) | (
+        summary["kind"] == BEST
+    )
+    ladder = {"behaviour cloning": 0, "random skills": 1, findings.main: 3}  # the best single skill between them
     played = sorted(
         summary.loc[chosen, ["contestant", "score"]].itertuples(index=False),
         key=lambda row: ladder.get(str(row.contestant), 2),
@@ -70,7 +72,7 @@ def _scores(found: Findings) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["who", "score"])
 
 
-def _measures(found: Findings, logs: Mapping[str, Path]) -> pd.DataFrame:
+def _measures(findings: Findings, logs: Mapping[str, Path]) -> pd.DataFrame:
     rows: list[tuple[str, str]] = []
 
     def logged(stage: str, column: str, name: str, form: str, factor: float = 1.0) -> None:
@@ -83,7 +85,7 @@ def _measures(found: Findings, logs: Mapping[str, Path]) -> pd.DataFrame:
     logged("skill", "val/codes_used", f"codes in use ({held_out})", ".0f")
     logged("policy", "val/clipped_share", "AWR weights that are clipped, %", ".1f", 100.0)
     logged("policy", "val/code_accuracy", "agreement of the policy with the data's codes, %", ".0f", 100.0)
-    start = found.facts("evaluate").get("start_value")
+    start = findings.facts("evaluate").get("start_value")
     if start:
         bounds = [start["low"], start["high"]]
         possible = "" if None in bounds else f" (possible: {bounds[0]:.3g} to {bounds[1]:.3g})"
@@ -92,7 +94,7 @@ def _measures(found: Findings, logs: Mapping[str, Path]) -> pd.DataFrame:
 
 
 def _last(path: Path | None, column: str) -> float:
-    """The last logged value of a column; NaN where there is none."""
+    """Return the last logged value of a column; NaN if there is none."""
     if path is None:
         return math.nan
     table = pd.read_csv(path)

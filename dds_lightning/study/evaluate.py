@@ -1,4 +1,4 @@
-"""`dds evaluate`: play a published agent, or a run's last and best checkpoint, and tell how."""
+"""`dds evaluate`: play a published agent, or a run's last and best checkpoint, and report the scores."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dds_lightning.rollout.play import rollout
 from dds_lightning.saving.published import load_published
 from dds_lightning.study.contestants import agent_directory, best_directory, way
 from dds_lightning.study.protocol import BEST, LAST, heading, paper_line, protocol
-from dds_lightning.tasks import Task, get_task
+from dds_lightning.tasks import Task, get_task, restore_task
 
 
 def evaluate(
@@ -32,37 +32,38 @@ def evaluate(
 ) -> Report:
     """Roll out a trained agent; arguments and JSON keys are those of `dds evaluate`.
 
+    The report's `protocol` is the last checkpoint's where both play; if the best one's differs, a line says how.
+
     Raises:
-        UserError: no agent there, or none of the wanted checkpoint, of the task or with a way of choosing.
+        UserError: There is no agent, or none of the requested checkpoint, for the task or with such a selection.
     """
     places = _places(directory, checkpoint)
     first = next(iter(places.values()))
-    name = task or load_published(first).config.get("task")
-    if name is None:
+    wanted = get_task(task) if task else restore_task(load_published(first).config, first)
+    if wanted is None:
         raise UserError(f"{first} does not say which task it is for: give --task")
-    wanted = get_task(name)
     count = wanted.evaluation_episodes if episodes is None else episodes
     if count < 1:
         raise UserError(f"--episodes is {count}, expected at least 1")
+    agents = {kind: _agent(place, wanted, seed, noise_scale) for kind, place in places.items()}
+    best = load_published(places[BEST]).config["checkpoint"] if BEST in places else None
     players: list[Contestant] = []
     shown: dict[str, str] = {}
-    facts: dict[str, Any] | None = None
-    for kind, place in places.items():
-        agent = _agent(place, wanted, seed, noise_scale)
-        if kind == BEST:
-            facts = load_published(place).config["checkpoint"]
+    for kind, agent in agents.items():
         for choice in dict.fromkeys(selection):
             heat = temperature if choice == "sample" else 1.0
-            players.append(way(agent, choice, count, heat, facts if kind == BEST else None))
+            players.append(way(agent, choice, count, heat, best if kind == BEST else None))
             shown[players[-1].name] = kind
-    kinds = " and ".join(places)
-    how = protocol(wanted, agent, episodes=count, seed=seed, temperature=temperature, checkpoint=kinds, best=facts)
+    settings: dict[str, Any] = {"episodes": count, "seed": seed, "temperature": temperature}
+    settings |= {"checkpoint": " and ".join(places), "best": best}
+    how, *others = [protocol(wanted, agent, **settings) for agent in agents.values()]
     result = rollout(wanted, players, seed=seed, workers=workers)
     summary = result.summary()
     summary.insert(1, "checkpoint", summary["actor"].map(shown))
-    data: dict[str, Any] = {"agent": places.get(LAST), "best": places.get(BEST), "task": name, "seed": seed}
+    data: dict[str, Any] = {"agent": places.get(LAST), "best": places.get(BEST), "task": wanted.name, "seed": seed}
     hidden = ["checkpoint", *([] if wanted.measures_success else ["success", "length_success"])]
-    lines: list[Any] = [heading(how), table(summary.drop(columns=hidden))]
+    differing = [f"The best checkpoint's: {heading({**other, 'checkpoint': BEST})}" for other in others if other != how]
+    lines: list[Any] = [heading(how), *differing, table(summary.drop(columns=hidden))]
     lines += [line] if (line := paper_line(wanted)) else []
     report = Report({**data, "protocol": how, "results": summary}, lines)
     if out is not None:
@@ -79,15 +80,15 @@ def _places(directory: Path, checkpoint: str) -> dict[str, Path]:
     best = best_directory(directory)
     if last == directory and isinstance(load_published(directory).config.get("checkpoint"), dict):
         last, best = None, directory  # what a run published as its best
-    found = {kind: place for kind, place in ((LAST, last), (BEST, best)) if place is not None}
+    places = {kind: place for kind, place in ((LAST, last), (BEST, best)) if place is not None}
     if checkpoint == "both":
-        return found
-    if checkpoint not in found:
+        return places
+    if checkpoint not in places:
         raise UserError(
-            f"--checkpoint is {checkpoint}, but {directory} holds only the {' and '.join(found)} one (`dds run "
+            f"--checkpoint is {checkpoint}, but {directory} holds only the {' and '.join(places)} one (`dds run "
             "--evaluate_every STEPS` keeps the best beside the last)"
         )
-    return {checkpoint: found[checkpoint]}
+    return {checkpoint: places[checkpoint]}
 
 
 def _agent(path: Path, task: Task, seed: int, noise_scale: float | None) -> DDSAgent:

@@ -1,4 +1,4 @@
-"""What a finished run found: everything a report tells, read back from the run's files."""
+"""What a finished run produced: everything that a report shows, read from the run's files."""
 
 from __future__ import annotations
 
@@ -12,26 +12,27 @@ import pandas as pd
 from dds_lightning.errors import UserError
 from dds_lightning.rollout.result import RolloutResult
 from dds_lightning.saving.run_directory import read_marker
+from dds_lightning.study.run_task import recall_task
 from dds_lightning.study.tables import failures_table, skills_table, summary_table
-from dds_lightning.tasks import Task, get_task
+from dds_lightning.tasks import Task, known_task
 
 STAGES = ("data", "skill", "relabel", "policy", "clone", "evaluate")
 
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """Everything a report tells, read from one run directory.
+    """Everything that a report shows, read from one run directory.
 
     Attributes:
-        root: the run directory.
-        task: what was played.
-        result: the evaluation's episodes and paths.
-        main: the contestant the run is about: the published agent as it acts by default.
-        singles: the contestant whose parts are the single skills; None if they did not play.
-        summary: see `tables.summary_table`.
-        failures: see `tables.failures_table`.
-        skills: see `tables.skills_table`.
-        markers: stage -> its marker.
+        root: The run directory.
+        task: What was played.
+        result: The evaluation's episodes and paths.
+        main: The contestant the run is about: the published agent as it acts by default.
+        singles: The contestant whose parts are the single skills; None if they did not play.
+        summary: See `tables.summary_table`.
+        failures: See `tables.failures_table`.
+        skills: See `tables.skills_table`.
+        markers: Stage -> its marker.
     """
 
     root: Path
@@ -49,17 +50,17 @@ class Findings:
         """Read a run directory.
 
         Raises:
-            UserError: it holds no evaluation, one of a task that this version does not know, or a stage of a newer
-                version.
+            UserError: The directory holds no evaluation, one of an unknown task, or a stage of a newer version.
         """
         if not (root / "evaluate" / "episodes.parquet").is_file():
             raise UserError(
                 f"{root} holds no evaluation (evaluate/episodes.parquet): expected a directory that `dds run` "
                 "has brought at least as far as its stage 'evaluate'"
             )
+        recall_task(root)
         result = RolloutResult.load(root / "evaluate")
         episodes = result.episodes
-        task = get_task(result.task)
+        task = known_task(result.task)
         main = str(episodes["actor"].iloc[0])
         parts = episodes.groupby("actor", sort=False)["label"].nunique()
         singles = next((str(name) for name in parts.index[parts > 1]), None)
@@ -83,7 +84,7 @@ class Findings:
         )
 
     def facts(self, stage: str) -> Mapping[str, Any]:
-        """What a stage's marker tells beside its files; empty where there is none."""
+        """Return the facts in a stage's marker; empty if there is none."""
         return self.markers.get(stage, {}).get("facts", {})
 
     @property

@@ -12,29 +12,29 @@ from dds_lightning.study.tables import BEST, CONTESTANT, SKILL, ends, markdown, 
 from dds_lightning.tasks import Task
 
 _OTHERS = 3
-"""Commonest ends that are listed for each contestant beside the main one."""
+"""Most frequent ends that are listed for each contestant other than the main one."""
 
 
-def page(found: Findings, files: Mapping[str, str], diagnosis: Mapping[str, pd.DataFrame]) -> str:
+def page(findings: Findings, files: Mapping[str, str], diagnosis: Mapping[str, pd.DataFrame]) -> str:
     """The report as Markdown.
 
     Args:
-        found: what it tells.
-        files: name -> file beside it, of those that were made.
-        diagnosis: the tables of `diagnosis.diagnose`.
+        findings: What it shows.
+        files: Name -> file beside it, of those that exist.
+        diagnosis: The tables of `diagnosis.diagnose`.
     """
-    parts = [f"# {found.task.name}", _opening(found), _results(found)]
+    parts = [f"# {findings.task.name}", _opening(findings), _results(findings)]
     if "scores" in files:
         parts.append(_picture(files, "scores", "Normalised scores; grey: single skills."))
     parts.append(diagnosis_section(diagnosis))
     if "trajectories" in files:
         parts.append("## How the policy gets there\n")
-        parts.append(_picture(files, "trajectories", f"{found.main}, coloured by the skill in use."))
+        parts.append(_picture(files, "trajectories", f"{findings.main}, coloured by the skill in use."))
     if "clip" in files:
         parts.append(_picture(files, "clip", "One episode: the successful one of median length, if any succeeded."))
-    parts.append(_skills(found, files))
+    parts.append(_skills(findings, files))
     if "failures" in files:
-        parts.append(_failures(found, files))
+        parts.append(_failures(findings, files))
     if "values" in files:
         parts.append("## What the critic believes\n")
         text = (
@@ -45,30 +45,30 @@ def page(found: Findings, files: Mapping[str, str], diagnosis: Mapping[str, pd.D
     if "training" in files:
         parts.append("## Training\n")
         parts.append(_picture(files, "training", "Read from the metrics.csv of both trainings."))
-    parts.append(_run(found))
+    parts.append(_run(findings))
     names = [name for name in ("summary", "failures", "skills") if name in files]
     tables = ", ".join(f"[{files[name]}]({files[name]})" for name in names)
     parts.append(f"Tables: {tables}; every episode is in [evaluate/episodes.parquet](../evaluate/episodes.parquet).")
     return "\n\n".join(part.strip() for part in parts if part) + "\n"
 
 
-def _opening(found: Findings) -> str:
-    row = found.summary.iloc[0]
-    task = found.task
+def _opening(findings: Findings) -> str:
+    row = findings.summary.iloc[0]
+    task = findings.task
     text = f"{headline(row, task)}, at most {task.max_episode_steps} steps an episode, in {task.env_id}"
     if task.maze_map is not None:
         text += f" from cell {task.start_cell} to cell {task.goal_cell}"
     lines = [text + "."]
-    lines += [f"{heading(found.protocol)}."] if found.protocol else []
+    lines += [f"{heading(findings.protocol)}."] if findings.protocol else []
     return "\n\n".join([*lines, *filter(None, [paper_line(task)])])
 
 
 def headline(row: pd.Series, task: Task) -> str:
-    """What a contestant reached, in half a sentence: the number that the task is judged by comes first.
+    """Say what a contestant reached in half a sentence; the number by which the task is judged comes first.
 
     Args:
-        row: of `tables.summary_table`.
-        task: what was played.
+        row: A row of `tables.summary_table`.
+        task: The task that was played.
     """
     error = "" if pd.isna(row["score_error"]) else f" ± {row['score_error']:.1f}"
     if not task.measures_success:
@@ -91,27 +91,27 @@ def headline(row: pd.Series, task: Task) -> str:
     return text + (f", median {row['length']:.0f} steps" if row["length"] == row["length"] else "")
 
 
-def _results(found: Findings) -> str:
-    notes = "Intervals are Wilson's, ± is" if found.task.measures_success else "± is"
+def _results(findings: Findings) -> str:
+    notes = "Intervals are Wilson's, ± is" if findings.task.measures_success else "± is"
     notes += " the standard error. All contestants played from the same starts."
-    if (found.summary["kind"] == BEST).any():
-        each = int(found.summary.loc[found.summary["kind"] == SKILL, "episodes"].iloc[0])
+    if (findings.summary["kind"] == BEST).any():
+        each = int(findings.summary.loc[findings.summary["kind"] == SKILL, "episodes"].iloc[0])
         notes += f" The best single skill was picked afterwards, from {each} episodes each, which flatters it."
-    table = readable(found.summary, found.task)
+    table = readable(findings.summary, findings.task)
     table["contestant"] = [
         name.strip() if kind == CONTESTANT else f"&nbsp;&nbsp;{name.strip()}"
-        for name, kind in zip(table["contestant"], found.summary["kind"], strict=True)
+        for name, kind in zip(table["contestant"], findings.summary["kind"], strict=True)
     ]
     return f"## Results\n\n{markdown(table)}\n\n{notes}"
 
 
-def _skills(found: Findings, files: Mapping[str, str]) -> str:
+def _skills(findings: Findings, files: Mapping[str, str]) -> str:
     formats = {"in data": ".1f", "chosen": ".1f", "alone": ".0f", "dx": ".2f", "dy": ".2f", "distance": ".2f"}
     headings = {"in data": "in data %", "chosen": "chosen %", "alone": "success alone %"}
-    if found.task.maze_map is None:
+    if findings.task.maze_map is None:
         formats |= {"alone": ".1f", "reward": ".3f"}
         headings["alone"] = "score alone"
-    table = found.skills
+    table = findings.skills
     shown = markdown(table.rename(columns=headings), {headings.get(k, k): v for k, v in formats.items()})
     text = "## The skills\n\n"
     if "starts_by_skill" in files:
@@ -120,7 +120,7 @@ def _skills(found: Findings, files: Mapping[str, str]) -> str:
         text += _picture(files, "skills_by_start", "The same from near; a number is where its skill ended.") + "\n\n"
     if "single_skills" in files:
         text += _picture(files, "single_skills", "Each skill alone from the task's own start.") + "\n\n"
-    text += shown + f"\n\nChosen: share of the decisions of {found.main}."
+    text += shown + f"\n\nChosen: share of the decisions of {findings.main}."
     if "dx" in table:
         text += " dx, dy and distance: mean change of the first two observations over a segment of the data."
     if "reward" in table:
@@ -137,14 +137,14 @@ def diagnosis_section(tables: Mapping[str, pd.DataFrame]) -> str:
     return text if tables["measures"].empty else f"{text}\n\n{markdown(tables['measures'])}"
 
 
-def _failures(found: Findings, files: Mapping[str, str]) -> str:
-    mine = found.failures["contestant"] == found.main
+def _failures(findings: Findings, files: Mapping[str, str]) -> str:
+    mine = findings.failures["contestant"] == findings.main
     text = "## Where failed episodes ended\n\n"
-    text += markdown(ends(found.failures[mine])) if mine.any() else f"No episode of {found.main} failed."
+    text += markdown(ends(findings.failures[mine])) if mine.any() else f"No episode of {findings.main} failed."
     if "failed_ends" in files:
         caption = "A dot is an end, the number on it the skill in use; bold numbers count the ends in a cell."
         text += "\n\n" + _picture(files, "failed_ends", caption)
-    others = found.failures[~mine].groupby("contestant", sort=False).head(_OTHERS)
+    others = findings.failures[~mine].groupby("contestant", sort=False).head(_OTHERS)
     if len(others):
         table = ends(others)
         table.insert(0, "contestant", others["contestant"].to_numpy())
@@ -152,13 +152,13 @@ def _failures(found: Findings, files: Mapping[str, str]) -> str:
     return text
 
 
-def _run(found: Findings) -> str:
+def _run(findings: Findings) -> str:
     from dds_lightning.saving.run_directory import duration
 
-    seconds = [(stage, float(marker.get("seconds", 0.0))) for stage, marker in found.markers.items()]
+    seconds = [(stage, float(marker.get("seconds", 0.0))) for stage, marker in findings.markers.items()]
     if not seconds:
         return ""
-    settings = found.markers.get("evaluate", {}).get("settings", {})
+    settings = findings.markers.get("evaluate", {}).get("settings", {})
     seed = f", seed {settings['seed']}" if "seed" in settings else ""
     lines = [f"| {stage} | {duration(spent)} |" for stage, spent in seconds]
     total = f"| all | {duration(sum(spent for _, spent in seconds))} |"

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dds_lightning.errors import UserError
 from dds_lightning.rollout.schedule import episode_seed
 from dds_lightning.tasks import Task
 from dds_lightning.tasks.facts import PAPERS_DATA
@@ -28,16 +29,16 @@ def protocol(
     checkpoint: str = LAST,
     best: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Everything a score depends on beside the weights.
+    """Return everything that a score depends on besides the weights.
 
     Args:
-        task: what is played, in its variant.
-        agent: who plays.
-        episodes: of each contestant.
-        seed: of environments and agents.
-        temperature: of sampled codes.
+        task: The task, in its variant.
+        agent: The agent that plays.
+        episodes: Episodes of each contestant.
+        seed: Seed of environments and agents.
+        temperature: Temperature of sampled codes.
         checkpoint: "last", "best" or "last and best".
-        best: facts of the best checkpoint, see `best_facts`, where it plays too.
+        best: Facts of the best checkpoint, see `best_facts`, where it plays too.
 
     Returns:
         Plain values: `task` (with its variant), `environment`, `episodes`, `seed`, `checkpoint`, `noise_scale`
@@ -52,7 +53,7 @@ def protocol(
         "episodes": episodes,
         "seed": seed,
         "checkpoint": checkpoint,
-        "noise_scale": float(settings["noise_scale"] if agent.noise_scale is None else agent.noise_scale),
+        "noise_scale": agent.noise_scale,
         "sampler": settings["sampler"] if settings["decoder"] == "diffusion" else None,
         "temperature": temperature,
         "horizon": agent.horizon,
@@ -65,12 +66,12 @@ def protocol(
 
 
 def full_name(task: Task) -> str:
-    """A task's name with its variant, as it can be typed."""
+    """Return a task's name with its variant, as it can be typed."""
     return f"{task.base_name}@{task.physics}" if task.physics else task.name
 
 
 def heading(facts: Mapping[str, Any]) -> str:
-    """A protocol as the one line above its table."""
+    """Return a protocol as the line above its table."""
     decoder = "decoder without noise"
     if facts["sampler"] is not None:
         decoder = f"decoder noise {facts['noise_scale']:g} ({facts['sampler']})"
@@ -82,26 +83,33 @@ def heading(facts: Mapping[str, Any]) -> str:
 
 
 def paper_line(task: Task) -> str | None:
-    """What the paper reports for a task and why it may not be comparable; None where it reports nothing."""
+    """Return what the paper reports for a task and why it may not be comparable; None where it reports nothing."""
     return None if task.paper_score is None else f"The paper reports {task.paper_score:.1f}, {PAPERS_DATA}."
 
 
 def best_facts(last: Path, best: Path) -> dict[str, Any]:
-    """How a training chose its best checkpoint, read from its two files.
+    """Return how a training chose its best checkpoint, read from its two files.
 
     Args:
-        last: the training's last checkpoint; it knows every evaluation.
-        best: the checkpoint that was kept.
+        last: The training's last checkpoint; it has the history of all evaluations.
+        best: The checkpoint that was kept.
 
     Returns:
-        `monitor` (name of the metric), `value`, `step` and `evaluations`, the number of them that the best was
-        chosen from (None where the metric is no rollout's).
+        `monitor` (name of the metric), `value`, `step` and `evaluations`, how many of them the best was chosen from
+        (None for a metric that no rollout measured).
+
+    Raises:
+        UserError: A file cannot be read, or `best` was not written by a `BestCheckpoint`.
     """
+    from dds_lightning.callbacks.best import BestCheckpoint, callback_state
+    from dds_lightning.callbacks.rollouts import RolloutEvaluation
     from dds_lightning.saving.checkpoint import load_ckpt
 
     checkpoint = load_ckpt(best)
-    kept = next(state for key, state in checkpoint["callbacks"].items() if key.startswith("BestCheckpoint"))
-    evaluated = load_ckpt(last)["callbacks"].get("RolloutEvaluation", {"history": []})
+    kept = callback_state(checkpoint, BestCheckpoint)
+    if kept is None:
+        raise UserError(f"{best} was not kept as a best checkpoint: it has no state of a BestCheckpoint")
+    evaluated = callback_state(load_ckpt(last), RolloutEvaluation) or {"history": []}
     count = sum(kept["monitor"] in row for row in evaluated["history"])
     return {
         "monitor": kept["monitor"],
@@ -112,7 +120,7 @@ def best_facts(last: Path, best: Path) -> dict[str, Any]:
 
 
 def start_value(task: Task, agent: DDSAgent, seed: int, episodes: int = 10) -> dict[str, float] | None:
-    """What the critic promises where episodes start, in discounted learning rewards.
+    """Return the critic's value where episodes start, in discounted learning rewards.
 
     Returns:
         `mean` of V over the starts of some evaluation episodes, and `low` and `high`, what rewards and discounts

@@ -1,4 +1,4 @@
-"""A finished run as a person looks at it: the table, figures, a clip and `report.md`, all from the run's files.
+"""The report of a finished run: the table, figures, a clip and `report.md`, all from the run's files.
 
 ```
  evaluate/episodes.parquet, paths.npz ─┐
@@ -6,7 +6,7 @@
  skill/logs  policy/logs  */stage.json ┘
 ```
 
-Nothing is taken from memory, so `report(directory)` draws the same again whenever it is called.
+Nothing is taken from memory, so `report(directory)` always draws the same.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from dds_lightning.study.diagnosis import diagnose
 from dds_lightning.study.findings import Findings
 from dds_lightning.study.protocol import heading, paper_line
 from dds_lightning.study.tables import ends, readable
-from dds_lightning.tasks import get_task
+from dds_lightning.tasks import known_task
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -39,7 +39,7 @@ def write_report(run_dir: str | Path) -> dict[str, Any]:
     """Write `report/` of a run directory; every file whole or not at all.
 
     Args:
-        run_dir: a directory of `dds run`, evaluated.
+        run_dir: A directory of `dds run`, evaluated.
 
     Returns:
         Paths of the files by name, and the facts that `told` prints, as plain JSON values: `task`, `main` (the
@@ -48,57 +48,59 @@ def write_report(run_dir: str | Path) -> dict[str, Any]:
         `diagnosis` (see `diagnosis.diagnose`).
 
     Raises:
-        UserError: nothing has been evaluated there, or a file is damaged.
+        UserError: The run has no evaluation, or a file is damaged.
     """
     from dds_lightning.console.reports import plain
     from dds_lightning.study.page import page
 
-    found = Findings.read(Path(run_dir))
-    folder = found.root / "report"
-    made: dict[str, Path] = {}
-    tables = ("summary", "failures", "skills") if found.task.measures_success else ("summary", "skills")
+    findings = Findings.read(Path(run_dir))
+    folder = findings.root / "report"
+    written: dict[str, Path] = {}
+    tables = ("summary", "failures", "skills") if findings.task.measures_success else ("summary", "skills")
     for name in tables:
-        made[name] = folder / f"{name}.csv"
-        with written_whole(made[name]) as part:
-            getattr(found, name).to_csv(part, index=False, lineterminator="\n")
-    logs = {stage: path for stage in ("skill", "policy") if (path := _metrics(found.root, stage, folder))}
-    made |= _draw(found, folder, logs)
-    diagnosis = diagnose(found, logs)
+        written[name] = folder / f"{name}.csv"
+        with written_whole(written[name]) as part:
+            getattr(findings, name).to_csv(part, index=False, lineterminator="\n")
+    logs = {stage: path for stage in ("skill", "policy") if (path := _metrics(findings.root, stage, folder))}
+    written |= _draw(findings, folder, logs)
+    diagnosis = diagnose(findings, logs)
     text = folder / "report.md"
     with written_whole(text) as part:
-        part.write_text(page(found, {name: path.name for name, path in made.items()}, diagnosis), encoding="utf-8")
-    failures = found.failures[found.failures["contestant"] == found.main].drop(columns="contestant")
+        part.write_text(
+            page(findings, {name: path.name for name, path in written.items()}, diagnosis), encoding="utf-8"
+        )
+    failures = findings.failures[findings.failures["contestant"] == findings.main].drop(columns="contestant")
     facts = {
-        "task": found.task.name,
-        "main": found.main,
-        "protocol": found.protocol,
-        "table": found.summary.round(4),
+        "task": findings.task.name,
+        "main": findings.main,
+        "protocol": findings.protocol,
+        "table": findings.summary.round(4),
         "failures": failures.round(4).astype(object).where(failures.notna(), None),
         "diagnosis": {name: table.round(4) for name, table in diagnosis.items()},
     }
-    if "failures" in made:
-        made["failures_table"] = made.pop("failures")  # the name belongs to the facts
-    return {"report": text, **made, **plain(facts)}
+    if "failures" in written:
+        written["failures_table"] = written.pop("failures")  # the name belongs to the facts
+    return {"report": text, **written, **plain(facts)}
 
 
 def report(run_dir: str | Path) -> Report:
-    """Write the report of a run directory once more, and tell what is in it.
+    """Write the report of a run directory again, and return what is in it.
 
     Raises:
-        UserError: as `write_report`.
+        UserError: As `write_report`.
     """
     from dds_lightning.console.reports import Report
 
-    made = write_report(run_dir)
-    paths = [f"{name}: {path}" for name, path in made.items() if isinstance(path, Path)]
-    return Report(made, [*told(made), *paths])
+    written = write_report(run_dir)
+    paths = [f"{name}: {path}" for name, path in written.items() if isinstance(path, Path)]
+    return Report(written, [*told(written), *paths])
 
 
 def told(facts: Mapping[str, Any]) -> list[RenderableType]:
-    """The facts of `write_report` for a terminal: the table, and where the main contestant's failures ended."""
+    """Format the facts of `write_report` for a terminal: the table, and where the main contestant's failures ended."""
     from dds_lightning.console.reports import table
 
-    task, protocol = get_task(facts["task"]), facts.get("protocol")
+    task, protocol = known_task(facts["task"]), facts.get("protocol")
     summary = readable(pd.DataFrame(facts["table"]), task)
     text: list[RenderableType] = [heading(protocol) if protocol else facts["task"], table(summary)]
     if line := paper_line(task):
@@ -115,50 +117,50 @@ def told(facts: Mapping[str, Any]) -> list[RenderableType]:
 # ---------------------------------------------------------------------- drawing
 
 
-def _draw(found: Findings, folder: Path, logs: Mapping[str, Path]) -> dict[str, Path]:
-    """Every figure that the run's files and its task allow."""
+def _draw(findings: Findings, folder: Path, logs: Mapping[str, Path]) -> dict[str, Path]:
+    """Draw every figure that the run's files and its task allow."""
     from dds_lightning.interpret.draw import bars, curves
 
-    made: dict[str, Path] = {}
+    written: dict[str, Path] = {}
 
     def keep(name: str, figure: Any) -> None:
-        made[name] = folder / f"{name}.png"
-        with written_whole(made[name]) as part:
-            # Without the version of matplotlib in it, the same picture is the same file.
+        written[name] = folder / f"{name}.png"
+        with written_whole(written[name]) as part:
+            # Without matplotlib's version in it, the same picture is the same file.
             figure.savefig(part, format="png", dpi=DPI, metadata={"Software": None})
 
-    if found.task.maze_map is not None:
-        _draw_maze(found, folder, keep, made)
+    if findings.task.maze_map is not None:
+        _draw_maze(findings, folder, keep, written)
     else:
-        keep("scores", bars.plot_scores(found.summary))
+        keep("scores", bars.plot_scores(findings.summary))
     if logs:
         keep("training", curves.plot_training_curves(dict(logs)))
-    return made
+    return written
 
 
-def _draw_maze(found: Findings, folder: Path, keep: Any, made: dict[str, Path]) -> None:
+def _draw_maze(findings: Findings, folder: Path, keep: Any, written: dict[str, Path]) -> None:
     from dds_lightning.interpret.draw import clip, maze
     from dds_lightning.study.skill_replays import stored_replays
 
-    task, result, main = found.task, found.result, found.main
+    task, result, main = findings.task, findings.result, findings.main
     if result.paths:
         keep("trajectories", maze.plot_trajectories(task, result, main))
         first = maze.choose_episodes(result, main)[0]
-        made["clip"] = folder / "episode.gif"
-        clip.write_clip(made["clip"], task, result.paths[main, first], main)
-        if found.singles:
-            keep("single_skills", maze.plot_single_skills(task, result, found.singles))
+        written["clip"] = folder / "episode.gif"
+        clip.write_clip(written["clip"], task, result.paths[main, first], main)
+        if findings.singles:
+            keep("single_skills", maze.plot_single_skills(task, result, findings.singles))
     keep("failed_ends", maze.plot_failures(task, result, main))
-    agent = found.root / "agent"
+    agent = findings.root / "agent"
     if (agent / "SHA256SUMS").is_file():
         stored = stored_replays(folder / "replays.npz", task, agent)
         starts, positions, codes, alive = (stored[name] for name in ("starts", "positions", "codes", "alive"))
         keep("starts_by_skill", maze.plot_starts_by_skill(task, starts, positions, codes, alive))
         keep("skills_by_start", maze.plot_skills_by_start(task, starts, positions, codes, alive))
-        keep("values", _value_map(found, agent))
+        keep("values", _value_map(findings, agent))
 
 
-def _value_map(found: Findings, directory: Path) -> Any:
+def _value_map(findings: Findings, directory: Path) -> Any:
     """The published critic over the maze, with the policy's likeliest codes and where the data say they lead."""
     import numpy as np
 
@@ -169,15 +171,15 @@ def _value_map(found: Findings, directory: Path) -> Any:
     assert policy is not None, "a run's agent has a policy"
     value, codes = value_and_codes(policy)
     directions = None
-    if "dx" in found.skills:
-        directions = np.nan_to_num(found.skills[["dx", "dy"]].to_numpy())
-    return plot_value_map(found.task, value, codes, directions)
+    if "dx" in findings.skills:
+        directions = np.nan_to_num(findings.skills[["dx", "dy"]].to_numpy())
+    return plot_value_map(findings.task, value, codes, directions)
 
 
 def _metrics(root: Path, stage: str, folder: Path) -> Path | None:
-    """One metrics file of a training that may have been interrupted: each launch logged into its own.
+    """Merge the metrics of a training that may have been interrupted: each launch logged to a file of its own.
 
-    What a launch logged after the step from which the next one went on was lost, and is left out.
+    What a launch logged after the step from which the next one resumed was lost, and is left out.
     """
     folders = sorted((root / stage / "logs").glob("version_*"), key=lambda path: int(path.name.split("_")[1]))
     launches: list[pd.DataFrame] = []

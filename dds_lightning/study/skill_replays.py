@@ -1,16 +1,17 @@
-"""Each skill replayed alone from several starts of a maze, so that one sees what it does where."""
+"""Each skill replayed alone from several starts of a maze, to show what it does where."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dds_lightning.interpret.measure.replay import junctions as junctions
-from dds_lightning.interpret.measure.replay import replay_codes, rest_states
+from dds_lightning.interpret.measure.replay import replay_codes
+from dds_lightning.interpret.measure.states import junctions as junctions
+from dds_lightning.interpret.measure.states import rest_states
 from dds_lightning.saving.files import written_whole
 from dds_lightning.tasks import Task
 
@@ -24,28 +25,28 @@ def replay_skills(task: Task, agent: DDSAgent, steps: int = 50, seed: int = 0) -
     """Play every skill alone from every junction, the body at rest.
 
     Args:
-        task: a maze.
-        agent: its decoder is used, its policy is not.
+        task: A maze.
+        agent: The agent whose decoder acts; its policy is not used.
         steps: T of each replay, if it does not reach the goal before.
-        seed: of the decoder's noise.
+        seed: Seed of the decoder's noise.
 
     Returns:
         `starts` (N, 2) where the body was set down, the same for all skills of a cell, `positions`
         (N, T + 1, 2) metres, `codes` (N,), `alive` (N, T), with N = cells x K.
     """
     states = rest_states(task, junctions(task))
-    made = replay_codes(task, agent.skill, states, steps=steps, noise_scale=agent.noise_scale, seed=seed)
-    positions = made.qpos[..., :2].astype(np.float32)
-    return {"starts": positions[:, 0], "positions": positions, "codes": made.codes, "alive": made.alive}
+    replays = replay_codes(task, agent.skill, states, steps=steps, noise_scale=agent.noise_scale, seed=seed)
+    positions = replays.qpos[..., :2].astype(np.float32)
+    return {"starts": positions[:, 0], "positions": positions, "codes": replays.codes, "alive": replays.alive}
 
 
 def stored_replays(path: Path, task: Task, directory: Path) -> Arrays:
-    """The replays in `path`; made and written there first unless they are of this agent already.
+    """Read the replays in `path`; first create them there unless they are of this agent already.
 
     Args:
-        path: the `.npz` file.
-        task: a maze.
-        directory: the published agent.
+        path: The `.npz` file.
+        task: A maze.
+        directory: The published agent.
     """
     from dds_lightning.agent import DDSAgent
 
@@ -55,6 +56,7 @@ def stored_replays(path: Path, task: Task, directory: Path) -> Arrays:
             if str(stored.get("key")) == key:
                 return {name: stored[name] for name in stored.files if name != "key"}
     arrays = replay_skills(task, DDSAgent.load(directory))
+    entries: dict[str, Any] = {"key": np.array(key), **arrays}
     with written_whole(path) as part, part.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, key=np.array(key), **arrays)
+        np.savez_compressed(file, **entries)
     return arrays

@@ -1,4 +1,4 @@
-"""`dds atlas`: what a place holds (a run, a published agent, a skill checkpoint), and the skill atlas of it."""
+"""`dds atlas`: what a path holds (a run, a published agent, a skill checkpoint), and its skill atlas."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from dds_lightning.saving.run_directory import read_marker
 from dds_lightning.skill import SkillModule
 from dds_lightning.study.contestants import agent_directory, way
 from dds_lightning.study.findings import Findings
-from dds_lightning.tasks import Task, get_task
+from dds_lightning.study.run_task import recall_task
+from dds_lightning.tasks import Task, get_task, known_task, restore_task
 
 SINGLE = "single skill"
 
@@ -30,11 +31,11 @@ class Subject:
     """What an atlas is about.
 
     Attributes:
-        agent: its skills, and its policy if there is one.
-        task: name of the task; None where nothing says it.
-        data: where the data are, `SOURCE:NAME`; None where nothing says it.
-        found: the evaluation of a finished run; None elsewhere.
-        about: what it is, in words.
+        agent: Its skills, and its policy if there is one.
+        task: Name of the task; None where nothing says it.
+        data: Where the data are, `SOURCE:NAME`; None where nothing says it.
+        found: The evaluation of a finished run; None elsewhere.
+        about: A description.
     """
 
     agent: DDSAgent
@@ -45,17 +46,18 @@ class Subject:
 
 
 def find_subject(place: Path, seed: int = 0) -> Subject:
-    """Look at a place.
+    """Find out what a path holds.
 
     Args:
-        place: a run of `dds run` that has learnt its skills at least, a published directory, or a skill checkpoint.
-        seed: of the agent.
+        place: A run of `dds run` that has learnt its skills at least, a published directory, or a skill checkpoint.
+        seed: Seed of the agent.
 
     Raises:
-        UserError: it is none of these.
+        UserError: The path holds none of these.
     """
     if place.is_file() or place.suffix == ".ckpt":
         return Subject(_skills_alone(place, seed), None, None, None, f"skill checkpoint {place}")
+    recall_task(place)
     data, task = _data_of(place)
     if not (place / "model.safetensors").is_file() and not (place / "agent" / "model.safetensors").is_file():
         checkpoint = place / "skill" / "last.ckpt"
@@ -68,7 +70,8 @@ def find_subject(place: Path, seed: int = 0) -> Subject:
     directory = agent_directory(place)
     from dds_lightning.saving.published import load_published
 
-    task = load_published(directory).config.get("task") or task
+    kept = restore_task(load_published(directory).config, directory)
+    task = kept.name if kept else task
     found = Findings.read(place) if (place / "evaluate" / "episodes.parquet").is_file() else None
     return Subject(DDSAgent.load(directory, seed=seed), task, data, found, f"published agent {directory}")
 
@@ -80,7 +83,7 @@ def _skills_alone(checkpoint: Path, seed: int) -> DDSAgent:
 
 
 def _data_of(run: Path) -> tuple[str | None, str | None]:
-    """Data and task of a run; nothing of what is no run."""
+    """Return data and task of a run; None for what is not a run."""
     marker = read_marker(run / "data")
     settings = marker.get("settings", {})
     collected = marker.get("outputs", {}).get("data")
@@ -98,14 +101,14 @@ def atlas(
     figures: Path | None = None,
     tell: Tell = lambda words: None,
 ) -> tuple[Atlas, Path]:
-    """Make and write the atlas of a place; the arguments are those of `dds atlas`.
+    """Create and write the atlas of a path; the arguments are those of `dds atlas`.
 
     Raises:
-        UserError: no skills there, no data or no task known, or they do not fit each other.
-        DataError: data that are damaged or another task's.
+        UserError: No skills there, no data or no task known, or they do not fit each other.
+        DataError: Data that are damaged or another task's.
     """
     from datamodules.relabel import check_widths
-    from datamodules.sources import load_trajectories, resolve_task
+    from datamodules.sources import load_trajectories
 
     tell("looking at the checkpoint")
     subject = find_subject(place, seed)
@@ -114,27 +117,29 @@ def atlas(
         raise UserError(f"{place} does not know its data: give --data, for example local:DIR, minari:ID or d4rl:FILE")
     if name is None:
         raise UserError(f"{place} does not say which task it is for: give --task; `dds tasks` lists them")
-    wanted = resolve_task(spec, get_task(name))
+    known = get_task(task) if task else known_task(name)  # a name from a file never opens another
     models = [SkillModule.load(path) for path in against]
     tell("reading the data")
-    trajectories = load_trajectories(spec, wanted)
+    trajectories = load_trajectories(spec, known)
+    wanted = trajectories.task
+    assert wanted is not None
     for model in (subject.agent.skill, *models):
         check_widths(trajectories, model)
     result, main, singles = _episodes(subject, wanted, episodes, seed, tell)
     others = [(DISCRETE if model.discrete else CONTINUOUS, model) for model in models]
     made = make_atlas(subject.agent, wanted, trajectories, result, main, singles, others=others, seed=seed, tell=tell)
-    words = ["dds", "atlas", str(place), "--data", spec, "--task", wanted.name, "--seed", str(seed)]
+    command = ["dds", "atlas", str(place), "--data", spec, "--task", wanted.name, "--seed", str(seed)]
     tell("writing the page")
     if figures is not None:
         write_pictures(made, figures, out.stem)
     about = _about(subject, wanted, spec, result, main)
-    return made, write_atlas(made, out, about, shlex.join([*words, "--out", str(out)]))
+    return made, write_atlas(made, out, about, shlex.join([*command, "--out", str(out)]))
 
 
 def _episodes(
     subject: Subject, task: Task, episodes: int, seed: int, tell: Tell
 ) -> tuple[RolloutResult | None, str | None, str | None]:
-    """Episodes with their paths, the policy's name and the single skills': a run's own, or played now."""
+    """Return episodes with their paths, and the names of policy and single skills: the run's, or played now."""
     found = subject.found
     if found is not None and found.task == task and found.result.paths:
         return found.result, found.main, found.singles

@@ -1,4 +1,4 @@
-"""From one row an episode to the tables of a report: pure functions, tables in, tables out."""
+"""From one row per episode to the tables of a report: pure functions of tables."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def wilson(successes: int, episodes: int, confidence: float = 0.95) -> tuple[flo
     """Wilson's score interval of a success rate (Wilson, 1927), sound also at 0 and at all successes.
 
     Args:
-        successes: how many.
-        episodes: out of how many.
-        confidence: coverage, for example 0.95.
+        successes: How many.
+        episodes: Out of how many.
+        confidence: Coverage, for example 0.95.
 
     Returns:
         Lower and upper bound in [0, 1]; both NaN without episodes.
@@ -40,10 +40,10 @@ def wilson(successes: int, episodes: int, confidence: float = 0.95) -> tuple[flo
 
 
 def summary_table(episodes: pd.DataFrame) -> pd.DataFrame:
-    """One row a contestant; under one of several parts the best of them and each.
+    """One row per contestant; below a contestant of several parts, the best part and each part.
 
     Args:
-        episodes: as in `RolloutResult.episodes`.
+        episodes: As in `RolloutResult.episodes`.
 
     Returns:
         Columns `contestant` (its name says how codes are chosen), `kind` ("contestant", "best" or "skill"),
@@ -101,11 +101,11 @@ def _rank(row: Mapping[str, Any]) -> tuple[float, float, float]:
 
 
 def failures_table(episodes: pd.DataFrame, task: Task) -> pd.DataFrame:
-    """Where failed episodes ended and with which skill, the commonest end first; none where nothing can fail.
+    """Where failed episodes ended and with which skill, the most frequent end first; empty where nothing can fail.
 
     Args:
-        episodes: as in `RolloutResult.episodes`.
-        task: says which cell a position is in.
+        episodes: As in `RolloutResult.episodes`.
+        task: Says which cell a position is in.
 
     Returns:
         Columns `contestant`, `row` and `column` of the end cell (missing where there is no maze), `skill` in
@@ -145,13 +145,13 @@ def skills_table(
     alone: pd.DataFrame | None,
     effects: Sequence[str] = ("dx", "dy", "distance"),
 ) -> pd.DataFrame:
-    """One row a code: how often the data use it and the policy chooses it, what it does, how it scores alone.
+    """One row per code: how often the data use it and the policy chooses it, what it does, how it scores alone.
 
     Args:
-        chosen: the codes of each of the policy's episodes.
-        data: summary of the relabelled data (`relabel/codes.csv`), if there is one.
-        alone: episodes of the single skills (rows of `RolloutResult.episodes`), if they played.
-        effects: columns of `data` that tell what a segment of the code does, in the data's units.
+        chosen: The codes of each of the policy's episodes.
+        data: Summary of the relabelled data (`relabel/codes.csv`), if there is one.
+        alone: Episodes of the single skills (rows of `RolloutResult.episodes`), if they played.
+        effects: Columns of `data` that say what a segment of the code does, in the data's units.
 
     Returns:
         Columns `skill`, `in data`, `chosen` (per cent), the effects, `alone` (mean normalised score, in a maze
@@ -168,9 +168,9 @@ def skills_table(
         table["in data"] = 100.0 * data.set_index("code")["share"].reindex(table["skill"]).to_numpy()
     table["chosen"] = 100.0 * np.bincount(codes, minlength=count) / max(len(codes), 1)
     if data is not None:
-        found = data.set_index("code").reindex(table["skill"])
+        by_code = data.set_index("code").reindex(table["skill"])
         for name in effects:
-            table[name] = found[name].to_numpy()
+            table[name] = by_code[name].to_numpy()
     if alone is not None:
         scores = alone.groupby("final_code")["score"].mean()
         table["alone"] = scores.reindex(table["skill"]).to_numpy(dtype=float)
@@ -180,7 +180,7 @@ def skills_table(
 def readable(summary: pd.DataFrame, task: Task) -> pd.DataFrame:
     """The summary as it is printed: units in the headings, a mean with its standard error, a rate with its interval.
 
-    Mazes are told by their success; elsewhere the normalised score comes first, with the return behind it.
+    In mazes success comes first; elsewhere the normalised score, followed by the return.
     """
     skill = summary["kind"] == SKILL
     columns: dict[str, Any] = {
@@ -236,8 +236,8 @@ def markdown(table: pd.DataFrame, formats: Mapping[str, str] | None = None) -> s
     """A DataFrame as a Markdown table: numbers to the right, missing values as a dash.
 
     Args:
-        table: small.
-        formats: column -> format of its numbers, for example ".1f".
+        table: Small.
+        formats: Column -> format of its numbers, for example ".1f".
     """
     formats = formats or {}
     header = [str(column) for column in table.columns]

@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import difflib
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from dds_lightning.errors import UserError
+from dds_lightning.tasks.own import build_task, definition, is_address, load_task
 from dds_lightning.tasks.rows import ROWS
 from dds_lightning.tasks.task import Cell as Cell
 from dds_lightning.tasks.task import Task as Task
@@ -19,6 +22,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _TABLE: dict[str, Task] = {task.name: task for task in ROWS}
+_OWN: dict[str, Task] = {}
+"""Tasks of one's own that this process has read."""
 
 
 def task_names() -> tuple[str, ...]:
@@ -26,17 +31,78 @@ def task_names() -> tuple[str, ...]:
     return tuple(_TABLE)
 
 
-def get_task(name: str) -> Task:
-    """Look a task up by name, `NAME` or `NAME@VARIANT`.
+def get_task(name: str | Task) -> Task:
+    """Look a task up.
+
+    Args:
+        name: `NAME` or `NAME@VARIANT` of the table, the path of a task file, `package.module:NAME` of a `Task`, or the
+            name of a task of one's own that this process has read before. A `Task` is returned as it is.
 
     Raises:
-        UserError: When there is no such task; the message lists the nearest names.
+        UserError: There is no such task; the message lists the nearest names.
     """
-    base, at, physics = str(name).partition("@")
+    if not isinstance(name, str):
+        return name
+    return remember(load_task(name)) if is_address(name) else known_task(name)
+
+
+def known_task(name: str) -> Task:
+    """Look up a name that stands in a file: of the table, or read before in this process; nothing is opened or run.
+
+    Raises:
+        UserError: There is no such task; the message lists the nearest names.
+    """
+    base, at, physics = name.partition("@")
+    if base in _OWN and not at:
+        return _OWN[base]
     if base not in _TABLE:
         near = difflib.get_close_matches(base, _TABLE, n=3, cutoff=0.5) or list(_TABLE)
         raise UserError(f"task: there is no task '{base}'; did you mean {', '.join(near)}? See `dds tasks`")
     return _TABLE[base].variant(physics) if at else _TABLE[base]
+
+
+def remember(task: Task) -> Task:
+    """Let a task of one's own be found by its name in this process.
+
+    Raises:
+        UserError: The table has a task of that name.
+    """
+    if task.base_name in _TABLE and task != known_task(task.name):
+        raise UserError(f"task: name is {task.name}, which the table has already; choose another name")
+    if task.base_name not in _TABLE:
+        _OWN[task.name] = task
+    return task
+
+
+def is_own(task: Task) -> bool:
+    """Whether a task is not of the table, so that whoever keeps its name must keep its definition too."""
+    return task.base_name not in _TABLE
+
+
+def restore_task(facts: Mapping[str, Any], where: str | Path) -> Task | None:
+    """The task that an agent or a run was made for.
+
+    Args:
+        facts: `task`, its name, and `task_definition` where it is not of the table; see `facts_to_keep`.
+        where: The file, for messages.
+
+    Returns:
+        The task; None where no name is kept.
+
+    Raises:
+        UserError: There is no such task, or its definition is not one.
+    """
+    kept = facts.get("task_definition")
+    if kept is not None:
+        if not isinstance(kept, Mapping):
+            raise UserError(f"{where}: task_definition is {kept!r}, expected names with values")
+        return remember(build_task(kept, f"{where}, task_definition", trusted=False))
+    return None if facts.get("task") is None else known_task(str(facts["task"]))
+
+
+def facts_to_keep(task: Task) -> dict[str, Any]:
+    """What an agent or a run keeps so that `restore_task` finds its task anywhere."""
+    return {"task": task.name, **({"task_definition": definition(task)} if is_own(task) else {})}
 
 
 def task_for_env(task: Task, env_id: str) -> Task | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -10,6 +12,7 @@ from numpy.typing import NDArray
 
 from dds_lightning.envs.build import build_env
 from dds_lightning.envs.kitchen import goal_vector, kitchen_layout
+from dds_lightning.tasks.bodies import body_of
 
 if TYPE_CHECKING:
     from dds_lightning.tasks import Task
@@ -29,6 +32,17 @@ def make_task_env(task: Task, render_mode: str | None = None) -> gym.Env[Flat, F
         **task.env_options,
     )
     return adapters[task.adapter](env, task)
+
+
+@contextlib.contextmanager
+def open_env(task: Task) -> Iterator[gym.Env[Flat, Flat]]:
+    """A task's environment after a reset, closed in the end."""
+    env = make_task_env(task)
+    try:
+        env.reset(seed=0)
+        yield env
+    finally:
+        env.close()
 
 
 class TaskEnv(gym.Wrapper[Flat, Flat, Any, Any]):
@@ -83,11 +97,9 @@ class MazeEnv(TaskEnv):
         return super()._outside(observation, info)
 
     def flatten(self, observation: Any) -> Any:
-        """A point mass' own observation; an ant's lacks its position, and newer ones add contact forces."""
-        seen = observation["observation"]
-        if self.task.family == "antmaze":
-            seen = np.concatenate([observation["achieved_goal"], seen[:27]])
-        return seen
+        """The parts that the robot's row names: an ant's own observation lacks its position."""
+        parts = body_of(self.task).parts.items()
+        return np.concatenate([observation[name][: part.columns] for name, part in parts])
 
 
 class KitchenEnv(TaskEnv):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from dds_lightning.tasks import get_task
-from dds_lightning.tasks.columns import action_names, observation_names
+from dds_lightning.tasks.bodies import action_names, observation_names
 from dds_lightning.tasks.task import Cell, Task
 
 REWARDS = {

@@ -68,6 +68,7 @@ class Task:
         data_start_cells: Cells where collected episodes start; None means every free cell.
         data_goal_cells: Cells that collected episodes head for; None means every free cell.
         paper_score: Normalised score that the paper reports in its table 1, if it does.
+        body: Name of the robot in `tasks.bodies`; "" takes the first word of the task's name.
     """
 
     name: str
@@ -104,6 +105,7 @@ class Task:
     data_start_cells: tuple[Cell, ...] | None = None
     data_goal_cells: tuple[Cell, ...] | None = None
     paper_score: float | None = None
+    body: str = ""
 
     # ------------------------------------------------------------------ variants
 

@@ -2,14 +2,14 @@
 
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from typing import Any
 
 import lightning.pytorch as pl
 from lightning.pytorch.callbacks import ProgressBar
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
+from dds_lightning.console.progress import progress_bar
 from dds_lightning.saving.run_directory import duration
 
 
@@ -33,8 +33,8 @@ class StepProgress(ProgressBar):
         super().__init__()
         self.metrics = metrics
         self.log_every_n_seconds = log_every_n_seconds
-        self._progress: Progress | None = None
-        self._line: TaskID | None = None
+        self._bar = ExitStack()
+        self._update: Callable[..., None] | None = None
         self._enabled = True
         self._next = self._started = 0.0
         self._first_step = 0
@@ -52,18 +52,10 @@ class StepProgress(ProgressBar):
         self._started, self._first_step = time.monotonic(), trainer.global_step
         self._next = self._started + (0 if self._terminal else self.log_every_n_seconds)
         if self._enabled and self._terminal and trainer.is_global_zero:
-            self._progress = Progress(
-                TextColumn("  step"),
-                BarColumn(),
-                MofNCompleteColumn(),
-                TimeRemainingColumn(),
-                TextColumn("{task.fields[facts]}"),
-                console=Console(stderr=True),
-                transient=True,
-            )
+            layout = ("  step", "bar", "count", "remaining", "{task.fields[facts]}")
             total = trainer.max_steps if trainer.max_steps > 0 else None
-            self._line = self._progress.add_task("", total=total, completed=trainer.global_step, facts="")
-            self._progress.start()
+            bar = progress_bar(layout, total, completed=trainer.global_step, facts="")
+            self._update = self._bar.enter_context(bar)
 
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -75,8 +67,8 @@ class StepProgress(ProgressBar):
         step = trainer.global_step
         rate = (step - self._first_step) / max(now - self._started, 1e-9)
         facts = f"{rate:,.0f} steps/s  " + self._facts(trainer.callback_metrics)
-        if self._progress is not None and self._line is not None:
-            self._progress.update(self._line, completed=step, facts=facts)
+        if self._update is not None:
+            self._update(completed=step, facts=facts)
             self._next = now + 0.3
             return
         left = f", {duration((trainer.max_steps - step) / max(rate, 1e-9))} left" if trainer.max_steps > 0 else ""
@@ -96,9 +88,8 @@ class StepProgress(ProgressBar):
         self._close()
 
     def _close(self) -> None:
-        if self._progress is not None:
-            self._progress.stop()
-            self._progress = None
+        self._bar.close()
+        self._update = None
 
     @property
     def _terminal(self) -> bool:

@@ -28,6 +28,7 @@ from dds_lightning.errors import UserError
 from dds_lightning.finetune import read
 from dds_lightning.saving.checkpoint import load_ckpt, stage_of
 from dds_lightning.saving.files import short
+from dds_lightning.tasks.own import is_address
 from dds_lightning.training.fit import advice_on_memory, fit, quieten
 from dds_lightning.training.stages import get_stage
 from dds_lightning.training.trainer import TrainingSettings, trainer_settings
@@ -140,6 +141,9 @@ class StageCLI(LightningCLI):
         if self.config.subcommand == "fit":  # one may look at a model with other data
             trained |= self.checkpoint.get(TrainingSettings.KEY, {})
         chosen = self._chosen()
+        task = trained.get("data.task")
+        if task and is_address(task) and "data.task" not in chosen:  # a file decides neither what is opened nor run
+            raise UserError(f"checkpoint {path} was trained for task {task}: give --data.task={task} again")
         for name, value in trained.items():
             if name in chosen and chosen[name] != value:
                 raise UserError(

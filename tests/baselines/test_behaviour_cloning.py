@@ -83,12 +83,12 @@ def test_the_actor_acts_inside_the_box_for_any_observation():
     actor = CloneActor(clone)
     actor.reset(5, seed=0)
     observations = np.random.default_rng(0).normal(0, 1e4, (5, 3)).astype(np.float32)
-    actions = actor.act(observations, np.zeros(5, bool), np.arange(5))
+    actions = actor.act(observations, np.zeros(5, bool), np.arange(5)).actions
     assert actions.shape == (5, 2)
     assert actions.dtype == np.float32
     assert (actions >= [-0.5, 0.0]).all()
     assert (actions <= [0.5, 3.0]).all()
-    np.testing.assert_allclose(actor.act(observations[3:], np.ones(2, bool), np.array([3, 4])), actions[3:])
+    np.testing.assert_allclose(actor.act(observations[3:], np.ones(2, bool), np.array([3, 4])).actions, actions[3:])
 
 
 def test_a_clone_without_statistics_says_so():
@@ -126,9 +126,9 @@ def test_fit_clone_writes_a_checkpoint_that_acts_alike_and_is_not_trained_twice(
     path = fit_clone(task, "local:anything", tmp_path / "clone", **options)
     assert path == tmp_path / "clone" / "last.ckpt"
     observations = random.uniform(-1, 1, (3, 4)).astype(np.float32)
-    actions = CloneActor.load(path).act(observations)
+    actions = CloneActor.load(path).act(observations).actions
     written = path.read_bytes()
     assert fit_clone(task, "local:anything", tmp_path / "clone", **options) == path
     assert path.read_bytes() == written
     fit_clone(task, "local:anything", tmp_path / "again", **options)
-    np.testing.assert_array_equal(CloneActor.load(tmp_path / "again" / "last.ckpt").act(observations), actions)
+    np.testing.assert_array_equal(CloneActor.load(tmp_path / "again" / "last.ckpt").act(observations).actions, actions)

@@ -11,7 +11,7 @@ import torch
 from dds_lightning.interpret.atlas import pictures as atlas_pictures
 from dds_lightning.study import subject as atlas
 from dds_lightning.tasks import get_task
-from tests.interpret.tiny import recorded, tiny_agent, tiny_skill
+from tests.interpret.tiny import hold_shorter, recorded, tiny_agent, tiny_skill
 
 TASK = get_task("pointmaze-umaze-diverse")
 
@@ -20,7 +20,7 @@ TASK = get_task("pointmaze-umaze-diverse")
 def _small_pictures():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(atlas_pictures, "DPI", 30)
-        patch.setattr(atlas_pictures, "HELD", {"pointmaze": 0.1})
+        hold_shorter(patch, pointmaze=0.1)
         patch.setattr(atlas, "make_atlas", functools.partial(atlas.make_atlas, states=3))
         yield
 

@@ -1,4 +1,4 @@
-"""Behaviour policies: the NumPy actor, the Ant's frames, the fast learner, and what is shipped."""
+"""Behaviour policies: the NumPy actor, the Ant's frames, and training."""
 
 import subprocess
 import sys
@@ -211,32 +211,6 @@ def test_heading_is_seen_within_45_degrees_and_speed_in_the_yaw_frame(ant):
 # ---------------------------------------------------------------------- training
 
 
-def test_worlds_step_as_gymnasium_does():
-    pytest.importorskip("stable_baselines3")
-    from datamodules.behaviours.training.worlds import RUNNERS, RunnerWorld
-    from dds_lightning.envs.build import build_env
-
-    for env_id in RUNNERS:
-        world = RunnerWorld(env_id, 2, seed=3)
-        world.reset()
-        env = build_env(env_id)
-        env.reset(seed=0)
-        env.unwrapped.set_state(world.qpos[0].copy(), world.qvel[0].copy())
-        rng = np.random.default_rng(0)
-        for _ in range(300):
-            actions = rng.uniform(-1, 1, (2, *env.action_space.shape)).astype(np.float32)
-            world.step_async(actions)
-            observations, rewards, done, infos = world.step_wait()
-            observation, reward, terminated, _, _ = env.step(actions[0])
-            mine = infos[0]["terminal_observation"] if done[0] else observations[0]
-            np.testing.assert_allclose(mine, observation, atol=1e-5)
-            assert rewards[0] == pytest.approx(reward, abs=1e-5)
-            assert done[0] == terminated
-            if terminated:
-                break
-        assert terminated == (env_id != "HalfCheetah-v4")  # random hoppers and walkers fall soon
-
-
 def tiny(name):
     from datamodules.behaviours.training.recipes import get_recipe
 
@@ -244,53 +218,48 @@ def tiny(name):
     return replace(recipe, environments=2, steps=256, settings={**recipe.settings, "n_steps": 64}, coarse_steps=128)
 
 
-@pytest.mark.parametrize("entropy_weight", [0.0, 0.01])
-def test_numpy_gradient_is_autograds(entropy_weight):
+def test_the_exported_actor_equals_the_learners():
     pytest.importorskip("stable_baselines3")
-    from datamodules.behaviours.training.fast_ppo import Minibatch
     from datamodules.behaviours.training.learner import build_learner, export_policy
 
     learner = build_learner(tiny("hopper"), seed=0)
-    policy, numbers = learner.policy, learner.numbers
-    rng = np.random.default_rng(0)
-    draw = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
-    observations, actions = draw(64, 11), draw(64, 3)
-    with torch.no_grad():
-        _, log_probs, _ = policy.evaluate_actions(torch.from_numpy(observations), torch.from_numpy(actions))
-    batch = Minibatch(observations, actions, log_probs.numpy() + 0.3 * draw(64), draw(64), draw(64))
-    numbers.compute_gradient(batch, 0.2, 0.25, entropy_weight)
-
-    values, log_probs, entropy = policy.evaluate_actions(torch.from_numpy(observations), torch.from_numpy(actions))
-    ratio = torch.exp(log_probs - torch.from_numpy(batch.log_probs))
-    gain = torch.from_numpy(batch.advantages)
-    surrogate = torch.min(gain * ratio, gain * ratio.clamp(0.8, 1.2)).mean()
-    loss = 0.25 * torch.nn.functional.mse_loss(values.flatten(), torch.from_numpy(batch.returns)) - surrogate
-    loss = loss - entropy_weight * entropy.mean()
-    policy.zero_grad()
-    loss.backward()
-    pairs = [(numbers.log_std_gradient, policy.log_std)]
-    modules = policy.mlp_extractor
-    for slopes, layers in (
-        (numbers.actor_gradient, [modules.policy_net[0], modules.policy_net[2], policy.action_net]),
-        (numbers.critic_gradient, [modules.value_net[0], modules.value_net[2], policy.value_net]),
-    ):
-        for (weight, bias), layer in zip(slopes, layers, strict=True):
-            pairs += [(weight, layer.weight), (bias, layer.bias)]
-    assert sum(found.size for found, _ in pairs) == sum(p.numel() for p in policy.parameters())
-    for found, parameter in pairs:
-        np.testing.assert_allclose(found, parameter.grad.numpy(), atol=1e-6)
-
+    learner.learn(128)
     world = learner.get_vec_normalize_env()
-    world.reset()
     raw = world.get_original_obs()
     expected, _ = learner.predict(world.normalize_obs(raw), deterministic=True)
     np.testing.assert_allclose(export_policy(learner, {}).act(raw), np.clip(expected, -1, 1), atol=1e-6)
 
 
+def test_runners_differ_from_each_other_and_repeat_with_the_seed():
+    pytest.importorskip("stable_baselines3")
+    from datamodules.behaviours.training.learner import build_world
+
+    first, again, other = (build_world(tiny("hopper"), seed).reset() for seed in (3, 3, 4))
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first[0] - first[1]).max() > 1e-5
+    assert np.abs(first - other).max() > 1e-5
+
+
+def test_the_first_steps_are_coarse_in_every_environment(tmp_path):
+    pytest.importorskip("stable_baselines3")
+    from datamodules.behaviours.training.learner import build_learner
+    from datamodules.behaviours.training.train import EULER, Bookkeeper
+
+    recipe = tiny("hopper")
+    book = Bookkeeper(recipe, build_learner(recipe, seed=0), tmp_path, hours=0.0)
+    true = book.integrator
+    assert true != EULER
+    for steps, expected in ((0, EULER), (127, EULER), (128, true)):
+        book.num_timesteps = steps
+        book._on_rollout_start()
+        assert [model.opt.integrator for model in book.models] == [expected] * 2
+    assert book.models[0] is not book.models[1]
+
+
 @pytest.mark.parametrize("name", ["hopper", "ant"])
 def test_training_leaves_snapshots_and_goes_on(tmp_path, name):
     pytest.importorskip("stable_baselines3")
-    from datamodules.behaviours.train import train
+    from datamodules.behaviours.training.train import train
 
     recipe = replace(tiny(name), rungs=2)
     assert train(recipe, tmp_path / "run") == 256
@@ -313,18 +282,34 @@ def test_resuming_restores_every_number(tmp_path):
     save_state(learner, tmp_path / "state.pt", {"hours": 1.5})
     again = build_learner(recipe, seed=1)
     assert load_state(again, tmp_path / "state.pt") == {"hours": 1.5}
-    np.testing.assert_array_equal(again.numbers.flat, learner.numbers.flat)
-    for mine, theirs in zip(again.moments, learner.moments, strict=True):
-        np.testing.assert_array_equal(mine, theirs)
-    assert (again.num_timesteps, again.adam_steps) == (256, learner.adam_steps)
+    for mine, theirs in zip(again.policy.parameters(), learner.policy.parameters(), strict=True):
+        assert torch.equal(mine, theirs)
+    mine, theirs = (one.policy.optimizer.state_dict()["state"] for one in (again, learner))
+    assert mine.keys() == theirs.keys()
+    assert all(torch.equal(mine[i][name], theirs[i][name]) for i in mine for name in ("exp_avg", "exp_avg_sq", "step"))
+    assert again.num_timesteps == 256
     world, other = again.get_vec_normalize_env(), learner.get_vec_normalize_env()
     np.testing.assert_array_equal(world.obs_rms.var, other.obs_rms.var)
     assert world.ret_rms.count == other.ret_rms.count
+    state = torch.load(tmp_path / "state.pt", weights_only=True)
+    del state["optimizer"]
+    torch.save(state, tmp_path / "state.pt")
+    with pytest.raises(UserError, match="an earlier version wrote it"):
+        load_state(again, tmp_path / "state.pt")
+
+
+@pytest.mark.parametrize("command", ["train", "publish"])
+def test_the_documented_commands_run(command):
+    if command == "train":
+        pytest.importorskip("stable_baselines3")
+    module = f"datamodules.behaviours.{command}"
+    ran = subprocess.run([sys.executable, "-m", module, "--help"], capture_output=True, text=True, check=True)
+    assert ran.stdout.startswith(f"usage: python -m {module} ")
 
 
 def test_rungs_spread_over_the_scores():
     pytest.importorskip("stable_baselines3")
-    from datamodules.behaviours.publish import choose_rungs
+    from datamodules.behaviours.training.publish import choose_rungs
 
     scores = [1.0, 5.0, 30.0, 20.0, 52.0, 80.0, 100.0, 70.0]
     assert choose_rungs(scores, 5) == [0, 2, 4, 5, 6]

@@ -16,7 +16,7 @@ import pytest
 
 from datamodules import WaypointController, collect_pointmaze, load_trajectories
 from datamodules.collect import pointmaze
-from datamodules.collect.behaviour import QUIET, BehaviourNoise
+from datamodules.collect.behaviour import QUIET, PointMazeRecipe
 from datamodules.trajectories import DataError
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import get_task
@@ -202,7 +202,7 @@ def test_an_interrupted_collection_goes_on_and_ends_with_the_same_bytes(
         collect()
     assert [path.name for path in tmp_path.iterdir()] == [f".{large.name}.recording"]  # no set, and what was recorded
     again = collect()
-    assert recorded == [0, 1, 2, 3, 4, 4]  # the first parcel was not recorded twice
+    assert recorded == [0, 1, 2, 3, 4, 4]  # the first chunk was not recorded twice
     assert (large / "data" / "main_data.hdf5").read_bytes() == (again / "data" / "main_data.hdf5").read_bytes()
     assert [path.name for path in tmp_path.iterdir()] == [large.name]
 
@@ -266,16 +266,16 @@ def test_progress_counts_steps_on_standard_error(tmp_path: Path, capfd: pytest.C
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"steps": 0}, "steps: found 0"),
-        ({"workers": 0}, "workers: found 0"),
-        ({"seed": -1}, "seed: found -1"),
-        ({"speed": 6.0}, "speed: found 6.0"),
-        ({"waypoint_offset": 0.5}, "waypoint_offset: found 0.5, expected 0 to 0.4"),
-        ({"start_offset": -0.1}, "start_offset: found -0.1"),
-        ({"action_noise": float("nan")}, "action_noise: found nan"),
-        ({"rest_share": 1.5}, r"rest_share: found 1\.5, expected 0 to 1"),
-        ({"burst_probability": 2.0}, "burst_probability: found 2.0"),
-        ({"burst_steps": (50, 10)}, r"burst_steps: found \(50, 10\)"),
+        ({"steps": 0}, "steps: got 0"),
+        ({"workers": 0}, "workers: got 0"),
+        ({"seed": -1}, "seed: got -1"),
+        ({"speed": 6.0}, "speed: got 6.0"),
+        ({"waypoint_offset": 0.5}, "waypoint_offset: got 0.5, expected 0 to 0.4"),
+        ({"start_offset": -0.1}, "start_offset: got -0.1"),
+        ({"action_noise": float("nan")}, "action_noise: got nan"),
+        ({"rest_share": 1.5}, r"rest_share: got 1\.5, expected 0 to 1"),
+        ({"burst_probability": 2.0}, "burst_probability: got 2.0"),
+        ({"burst_steps": (50, 10)}, r"burst_steps: got \(50, 10\)"),
         ({"task": "pointmaze-giant"}, "no task 'pointmaze-giant'"),
     ],
 )
@@ -285,10 +285,10 @@ def test_settings_out_of_range_are_refused(options: dict[str, Any], message: str
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("noise", [QUIET, BehaviourNoise()])
-def test_the_controller_crosses_the_large_maze_well_within_the_cap(noise: BehaviourNoise) -> None:
+@pytest.mark.parametrize("recipe", [QUIET, PointMazeRecipe()])
+def test_the_controller_crosses_the_large_maze_well_within_the_cap(recipe: PointMazeRecipe) -> None:
     task = get_task(LARGE)
-    env, actor = task.make_env(), WaypointController(task, noise)
+    env, actor = task.make_env(), WaypointController(task, recipe)
     actor.reset(1, seed=0)
     lengths = []
     for seed in range(4):
@@ -305,7 +305,7 @@ def test_the_controller_crosses_the_large_maze_well_within_the_cap(noise: Behavi
 
 
 def test_the_controller_acts_for_a_batch_and_repeats_with_its_seed() -> None:
-    actor = WaypointController(LARGE, BehaviourNoise())
+    actor = WaypointController(LARGE, PointMazeRecipe())
     observations = np.tile(np.array([-4.5, -3.0, 0, 0], np.float32), (3, 1))
     runs = []
     for _ in range(2):
@@ -316,4 +316,3 @@ def test_the_controller_acts_for_a_batch_and_repeats_with_its_seed() -> None:
     assert np.abs(runs[0]).max() <= 1
     np.testing.assert_array_equal(runs[0], runs[1])
     assert not np.array_equal(runs[0][:, 0], runs[0][:, 1])
-    assert actor.codes is None

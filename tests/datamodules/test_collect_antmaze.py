@@ -16,7 +16,7 @@ from datamodules import load_trajectories
 from datamodules.collect import antmaze, recording
 from datamodules.collect.antmaze import AntMazeRecipe, AntNavigator, collect_antmaze
 from dds_lightning.errors import UserError
-from dds_lightning.rollout.actors import Contestant, EveryRow
+from dds_lightning.rollout.actors import Contestant
 from dds_lightning.rollout.play import rollout
 from dds_lightning.tasks import get_task
 
@@ -83,16 +83,16 @@ def test_an_interrupted_collection_goes_on_and_ends_with_the_same_bytes(
     assert not left.exists()
 
 
-def test_parcels_of_other_settings_are_not_taken(tmp_path: Path) -> None:
-    first = recording.Kept(tmp_path / "set", {"seed": 0})
+def test_chunks_of_other_settings_are_not_taken(tmp_path: Path) -> None:
+    first = recording.PartialRecording(tmp_path / "set", {"seed": 0})
     first.open()
     first.write(0, [{"rewards": np.arange(3.0), "infos": {"goal": np.ones((4, 2))}}])
     (episode,) = first.read(0)
     np.testing.assert_array_equal(episode["infos"]["goal"], np.ones((4, 2)))
-    again = recording.Kept(tmp_path / "set", {"seed": 0})
+    again = recording.PartialRecording(tmp_path / "set", {"seed": 0})
     again.open()
     assert again.has(0)
-    other = recording.Kept(tmp_path / "set", {"seed": 1})
+    other = recording.PartialRecording(tmp_path / "set", {"seed": 1})
     other.open()
     assert not other.has(0)
 
@@ -156,18 +156,18 @@ def test_a_flipped_ant_lies_there_unless_told_otherwise() -> None:
 
 def test_the_navigator_reaches_the_goal() -> None:
     task = dataclasses.replace(get_task("antmaze-umaze"), max_episode_steps=400)
-    result = rollout(task, [Contestant("navigator", EveryRow(AntNavigator(task)), 4)], workers=0, progress=False)
+    result = rollout(task, [Contestant("navigator", AntNavigator(task), 4)], workers=0, progress=False)
     assert result.episodes["success"].sum() >= 3  # now and then an ant falls over
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"task": "pointmaze-umaze-play"}, "is no AntMaze in D4RL's physics"),
-        ({"task": "antmaze-umaze@robotics"}, "is no AntMaze in D4RL's physics"),
-        ({"steps": 0}, "steps: found 0"),
-        ({"seed": -1}, "seed: found -1"),
-        ({"workers": 0}, "workers: found 0"),
+        ({"task": "pointmaze-umaze-play"}, "cannot be collected here, expected a task of antmaze in d4rl physics"),
+        ({"task": "antmaze-umaze@robotics"}, "cannot be collected here, expected a task of antmaze in d4rl physics"),
+        ({"steps": 0}, "steps: got 0"),
+        ({"seed": -1}, "seed: got -1"),
+        ({"workers": 0}, "workers: got 0"),
     ],
 )
 def test_settings_out_of_range_are_refused(options: dict[str, Any], message: str, tmp_path: Path) -> None:
@@ -178,5 +178,5 @@ def test_settings_out_of_range_are_refused(options: dict[str, Any], message: str
 
 @pytest.mark.parametrize("setting", [{"action_noise": -0.1}, {"waypoint_noise": 2.0}, {"episode_steps": 0}])
 def test_recipes_out_of_range_are_refused(setting: dict[str, Any]) -> None:
-    with pytest.raises(UserError, match=f"{next(iter(setting))}: found"):
+    with pytest.raises(UserError, match=f"{next(iter(setting))}: got"):
         AntMazeRecipe(**setting)

@@ -86,7 +86,7 @@ def test_the_hand_gets_where_it_should_and_no_faster_than_it_may(env: gym.Env[An
         seen, *_ = env.step(arm.action(arm.velocity(aim, SCRIPTS["microwave"].posture), CLOSED))
         arm.see(kitchen_layout(seen["observation"]))
         points.append(arm.hand()[0])
-    distance, angle = arm.lacks(aim)
+    distance, angle = arm.error(aim)
     assert np.linalg.norm(distance) < 0.015
     assert np.linalg.norm(angle) < 0.05
     assert np.linalg.norm(np.diff(points, axis=0), axis=1).max() / STEP < 0.36
@@ -287,9 +287,9 @@ def test_an_interrupted_collection_goes_on_where_it_stopped(tmp_path: Path, monk
 @pytest.mark.parametrize(
     ("task", "options", "message"),
     [
-        ("hopper-medium", {}, "no kitchen task"),
-        ("kitchen-mixed", {"steps": 0}, "steps: found 0"),
-        ("kitchen-mixed", {"seed": -1}, "seed: found -1"),
+        ("hopper-medium", {}, "expected a task of kitchen"),
+        ("kitchen-mixed", {"steps": 0}, "steps: got 0"),
+        ("kitchen-mixed", {"seed": -1}, "seed: got -1"),
     ],
 )
 def test_a_wrong_wish_is_refused_at_once(task: str, options: dict[str, Any], message: str, tmp_path: Path) -> None:
@@ -303,7 +303,7 @@ def test_a_wrong_wish_is_refused_at_once(task: str, options: dict[str, Any], mes
     [("action_noise", -0.1), ("waypoint_noise", 0.2), ("speed_noise", 2.0), ("aimed_share", -1.0), ("tries", 0)],
 )
 def test_a_recipe_out_of_range_is_refused(name: str, value: float) -> None:
-    with pytest.raises(UserError, match=f"{name}: found {value}"):
+    with pytest.raises(UserError, match=f"{name}: got {value}"):
         KitchenRecipe(**{name: value})
 
 

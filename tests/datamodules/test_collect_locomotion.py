@@ -48,7 +48,7 @@ def test_medium_is_the_rung_nearest_to_42_percent_of_the_expert() -> None:
     assert list(mixture(ladder(), "medium")) == ["045"]
     assert list(mixture(ladder(), "medium-replay")) == ["001", "020", "045"]
     assert list(mixture(ladder(), "medium-expert")) == ["045", "100"]
-    with pytest.raises(UserError, match="quality: found 'random'"):
+    with pytest.raises(UserError, match="quality: got 'random'"):
         mixture(ladder(), "random")
 
 
@@ -102,9 +102,9 @@ def test_the_shipped_ladder_gives_medium_and_expert_scores(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"task": "kitchen-mixed"}, "is no locomotion task"),
-        ({"steps": 0}, "steps: found 0"),
-        ({"workers": 0}, "workers: found 0"),
+        ({"task": "kitchen-mixed"}, "expected a task of locomotion"),
+        ({"steps": 0}, "steps: got 0"),
+        ({"workers": 0}, "workers: got 0"),
     ],
 )
 def test_settings_out_of_range_are_refused(options: dict[str, Any], message: str, tmp_path: Path) -> None:
@@ -115,13 +115,15 @@ def test_settings_out_of_range_are_refused(options: dict[str, Any], message: str
 
 @pytest.mark.parametrize("setting", [{"action_noise": -0.1}, {"episode_steps": 0}])
 def test_recipes_out_of_range_are_refused(setting: dict[str, Any]) -> None:
-    with pytest.raises(UserError, match=f"{next(iter(setting))}: found"):
+    with pytest.raises(UserError, match=f"{next(iter(setting))}: got"):
         LocomotionRecipe(**setting)
 
 
 def test_the_behaviours_play_again_each_in_its_own_environments() -> None:
     quiet, noisy = LocomotionRecipe(action_noise=0.0), LocomotionRecipe(action_noise=0.1)
-    actions = Runners("hopper-medium-expert", quiet, ladder()).act(np.zeros((4, 11), np.float32))
+    four = Runners("hopper-medium-expert", quiet, ladder())
+    four.reset(4)
+    actions = four.act(np.zeros((4, 11), np.float32))
     assert np.allclose(actions, np.array([0.4, 0.8, 0.4, 0.8])[:, None])
     runners, again = (Runners("hopper-medium", noisy, ladder()) for _ in range(2))
     runners.reset(2, seed=3)

@@ -1,102 +1,192 @@
-"""Which family has a collector, and how given data are told from changed ones."""
+"""Which family has a collector, what one shares with the others, and how a new one is added."""
 
 from __future__ import annotations
 
-import os
+import json
+import sys
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
+import numpy as np
 import pytest
 
-from datamodules.collect.collectors import COLLECTORS, collect, collection_command, refuse_uncollectable
-from datamodules.sources import locate, stat_hash
+from datamodules.collect import antmaze, collectors
+from datamodules.collect.antmaze import AntMazeRecipe
+from datamodules.collect.collecting import Collector, DataSetPlan
+from datamodules.collect.collectors import (
+    COLLECTORS,
+    can_collect,
+    collect,
+    collection_command,
+    collector_of,
+    refuse_uncollectable,
+)
+from datamodules.sources import load_trajectories
+from dds_lightning.envs.build import build_env
 from dds_lightning.errors import UserError
-from dds_lightning.tasks import get_task, task_names
+from dds_lightning.study.contestants import behaviour_controller
+from dds_lightning.tasks import Task, get_task, task_names
+
+POINT = "pointmaze-umaze-play"
 
 
-def test_each_family_has_a_collector_that_can_be_imported_or_says_where_data_come_from(monkeypatch):
-    import importlib
+def test_every_collector_serves_the_tasks_that_it_is_registered_for() -> None:
+    served = [task for task in map(get_task, task_names()) if can_collect(task)]
+    assert {(task.family, task.physics) for task in served} == set(COLLECTORS)
+    for task in served:
+        collector = collector_of(task)
+        assert collector is not None
+        assert collector.family == task.family
+        assert collector.physics in (None, task.physics)
+        collector.recipe()
 
-    for module, *names in COLLECTORS.values():
-        assert all(callable(getattr(importlib.import_module(module), name)) for name in names if name)
-    monkeypatch.setattr("datamodules.collect.collectors.COLLECTORS", {})
+
+def test_a_task_without_a_collector_says_where_data_come_from(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(collectors, "COLLECTORS", {})
     for name in task_names():
         with pytest.raises(UserError, match=rf"'{name}'.*d4rl:FILE.*minari:ID.*dds data fetch {name}"):
             refuse_uncollectable(get_task(name))
+        assert behaviour_controller(get_task(name)) is None
 
 
-def test_collecting_goes_to_the_collector_of_the_family(monkeypatch):
-    import datamodules.collect.pointmaze as module
-
-    def collector(*given, **options):
-        return given, options
-
-    monkeypatch.setattr(module, "collect_pointmaze", collector)
-    task = get_task("pointmaze-umaze-play")
-    given, options = collect(task.name, 100, 3, "out", 2, dataset_id="mine")
-    assert given == (task, 100, 3, "out", 2)
-    assert options == {"dataset_id": "mine", "overwrite": False}
+# ---------------------------------------------------------------------- a new one: one record and one entry
 
 
-def test_a_recipe_says_what_the_behaviour_does(monkeypatch):
-    import datamodules.collect.antmaze as ants
-    import datamodules.collect.pointmaze as points
+@dataclass(frozen=True)
+class ToyRecipe:
+    """What the toy behaviour does."""
 
-    monkeypatch.setattr(ants, "collect_antmaze", lambda *given, **options: options)
-    options = collect("antmaze-umaze", 100, recipe={"action_noise": 0.1, "end_when_flipped": True})
-    assert options["recipe"] == ants.AntMazeRecipe(action_noise=0.1, end_when_flipped=True)
-    called = {}
+    push: float = 0.5
 
-    def collector(*given, speed=4.5, dataset_id=None, overwrite=False):
-        called.update(speed=speed)
 
-    monkeypatch.setattr(points, "collect_pointmaze", collector)
-    collect("pointmaze-umaze-play", 100, recipe={"speed": 3})
-    assert called == {"speed": 3}
+class ToyRecorder:
+    """Records one episode of a body that stands still."""
+
+    def __init__(self, steps: int, recipe: ToyRecipe) -> None:
+        self.steps, self.rounds, self.recipe = steps, 1, recipe
+
+    def __call__(self, number: int) -> list[dict[str, Any]]:
+        steps, goals = self.steps, np.zeros((self.steps + 1, 2))
+        return [
+            {
+                "observations": {"observation": np.ones((steps + 1, 4)), "achieved_goal": goals, "desired_goal": goals},
+                "actions": np.full((steps, 2), self.recipe.push, np.float32),
+                "rewards": np.zeros(steps),
+                "terminations": np.zeros(steps, bool),
+                "truncations": np.arange(steps) == steps - 1,
+            }
+        ]
+
+
+class ToyActor:
+    """Pushes."""
+
+    def __init__(self, task: Task, recipe: ToyRecipe) -> None:
+        self.task, self.recipe = task, recipe
+
+
+def plan_toys(task: Task, seed: int, steps: int, recipe: ToyRecipe) -> DataSetPlan:
+    env = build_env(task.env_id)
+    return DataSetPlan(ToyRecorder(steps, recipe), env, env.observation_space, "toy", "toys", {"toys": 1})
+
+
+@pytest.fixture
+def toys(monkeypatch: pytest.MonkeyPatch) -> Task:
+    """A task whose family nothing but a toy collects."""
+    module = ModuleType("toy_collector")
+    module.COLLECTOR = Collector("pointmaze", None, 30, ToyRecipe, plan_toys, ToyActor)  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "toy_collector", module)
+    monkeypatch.setattr(collectors, "COLLECTORS", {("pointmaze", ""): "toy_collector"})
+    return get_task(POINT)
+
+
+def test_a_new_collector_is_one_record_and_one_entry(toys: Task, tmp_path: Path) -> None:
+    assert can_collect(toys)
+    assert not can_collect(get_task("kitchen-mixed"))
+    folder = collect(toys, 20, seed=4, out=tmp_path, workers=1, recipe={"push": 0.25})
+    assert (load_trajectories(f"local:{folder}", POINT, reward="recorded").actions == 0.25).all()
+    assert collection_command(folder) == f"dds data collect {POINT} --steps=20 --seed=4 --recipe.push=0.25"
+    made = json.loads((folder / "data" / "metadata.json").read_text())["collection"]
+    assert made == {"task": POINT, "seed": 4, "steps": 20, "push": 0.25, "toys": 1}
+    with pytest.raises(UserError, match=r"recipe.speed: .* has no such setting; it has push"):
+        collect(toys, 20, out=tmp_path, recipe={"speed": 3})
+    actor = behaviour_controller(toys)
+    assert isinstance(actor, ToyActor)
+    assert actor.recipe == ToyRecipe()
+
+
+def test_a_collector_takes_its_recipe_whole_or_in_parts(toys: Task, tmp_path: Path) -> None:
+    collector = collector_of(toys)
+    assert collector is not None
+    given = {"whole": {"recipe": ToyRecipe(0.1)}, "parts": {"push": 0.1}, "both": {"recipe": ToyRecipe(), "push": 0.1}}
+    for name, options in given.items():
+        folder = collector.collect(POINT, out=tmp_path, workers=1, dataset_id=name, progress=False, **options)
+        loaded = load_trajectories(f"local:{folder}")
+        assert np.allclose(loaded.actions, 0.1)
+        assert loaded.num_steps == collector.steps
+    with pytest.raises(UserError, match="'kitchen-mixed' cannot be collected here, expected a task of pointmaze"):
+        collector.collect("kitchen-mixed", out=tmp_path)
+
+
+def test_a_recipe_says_what_the_behaviour_does(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    asked: list[AntMazeRecipe] = []
+
+    def plan(task: Task, seed: int, steps: int, recipe: AntMazeRecipe) -> DataSetPlan:
+        asked.append(recipe)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(antmaze, "COLLECTOR", replace(antmaze.COLLECTOR, plan=plan))
+    with pytest.raises(KeyboardInterrupt):
+        collect("antmaze-umaze", 100, out=tmp_path, recipe={"action_noise": 0.1, "end_when_flipped": True})
+    assert asked == [AntMazeRecipe(action_noise=0.1, end_when_flipped=True)]
+
+
+# ---------------------------------------------------------------------- the behaviours as actors
+
+
+@pytest.mark.parametrize("name", ["pointmaze-large-play", "antmaze-umaze", "hopper-medium-replay", "kitchen-partial"])
+def test_a_behaviour_acts_the_same_whichever_environments_have_finished(name: str) -> None:
+    task = get_task(name)
+    env = task.make_env()
+    start = np.stack([env.reset(seed=seed)[0] for seed in range(3)]).astype(np.float32)
+    env.close()
+    actor = behaviour_controller(task)
+    acted = []
+    for live in ([0, 1, 2], [0, 2]):
+        rows = np.array(live)
+        actor.reset(3, seed=1)
+        actions = [actor.act(start, np.ones(3, bool), np.arange(3))[[0, 2]]]
+        for _ in range(40):  # long enough for the kitchen's arm to give up a move, and draw again
+            chosen = actor.act(start[rows], np.zeros(len(rows), bool), rows)
+            actions.append(chosen[[0, -1]])
+        acted.append(np.stack(actions))
+    np.testing.assert_array_equal(acted[0], acted[1])
+    assert not np.array_equal(acted[0][0], acted[0][1]), "the noise stands still"
+    actor.reset(3, seed=1)
+    np.testing.assert_array_equal(actor.act(start, np.ones(3, bool))[[0, 2]], acted[0][0])
+
+
+# ---------------------------------------------------------------------- recipes and commands
 
 
 @pytest.mark.parametrize(
     ("task", "recipe", "message"),
     [
         ("antmaze-umaze", {"noise": 0.1}, r"recipe.noise: 'antmaze-umaze' has no such setting; it has action_noise, "),
-        ("antmaze-umaze", {"action_noise": -1}, "action_noise: found -1, expected"),
-        ("hopper-medium", {"action_noise": "much"}, "recipe.action_noise: found 'much', expected a number"),
+        ("antmaze-umaze", {"action_noise": -1}, "action_noise: got -1, expected"),
+        ("hopper-medium", {"action_noise": "much"}, "recipe.action_noise: got 'much', expected a number"),
         ("pointmaze-umaze-play", {"overwrite": True}, "recipe.overwrite: .* has no such setting; it has episode_steps"),
     ],
 )
-def test_a_recipe_that_is_none_is_refused(task, recipe, message, tmp_path):
+def test_a_recipe_out_of_range_is_refused(task: str, recipe: dict[str, Any], message: str, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=message):
         collect(task, 100, out=tmp_path, recipe=recipe)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_hash_of_files_changes_with_names_sizes_and_times(tmp_path, monkeypatch):
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    monkeypatch.setenv("D4RL_DATASET_DIR", str(tmp_path / "d4rl"))
-    file = tmp_path / "set" / "data.hdf5"
-    file.parent.mkdir()
-    file.write_bytes(b"abc")
-    (tmp_path / "d4rl").mkdir()
-    (tmp_path / "d4rl" / "one.hdf5").write_bytes(b"abc")
-    specs = [f"local:{tmp_path}/set", "minari:set", f"d4rl:{file}", "d4rl:one.hdf5", f"arrays:{tmp_path}/set"]
-    before = {spec: stat_hash(spec) for spec in specs}
-    assert before == {spec: stat_hash(spec) for spec in specs}
-    assert before["local:" + str(tmp_path / "set")] == before["minari:set"]
-    os.utime(file, ns=(1, 1))
-    changed = [spec for spec in specs if stat_hash(spec) != before[spec]]
-    assert changed == [spec for spec in specs if spec != "d4rl:one.hdf5"]
-    assert locate("d4rl:one.hdf5") == tmp_path / "d4rl" / "one.hdf5"
-
-
-@pytest.mark.parametrize(
-    "spec", ["local:nowhere", "minari:nowhere", "d4rl:no/where.hdf5", "ftp:there", "local:", "d4rl:"]
-)
-def test_what_is_not_there_is_said_in_one_sentence(spec):
-    with pytest.raises(UserError, match=r"nothing at|missing|expected one of local:"):
-        stat_hash(spec)
-    assert list(Path().iterdir()) == []
-
-
-def test_a_collected_set_tells_the_command_that_makes_it_again(tmp_path):
+def test_a_collected_set_knows_the_command_that_makes_it_again(tmp_path: Path) -> None:
     recipe = {"action_noise": 0.06}
     folder = collect("hopper-medium", 40, seed=3, out=tmp_path, workers=1, recipe=recipe)
     assert collection_command(folder) == (
@@ -107,5 +197,10 @@ def test_a_collected_set_tells_the_command_that_makes_it_again(tmp_path):
         "dds data collect pointmaze-umaze-diverse --steps=40 --seed=0 --recipe.episode_steps=20 --recipe.speed=3"
     )
     (folder / "data" / "metadata.json").write_text('{"collection": {"task": "mine"}}')
+    assert collection_command(folder) is None
+    code = tmp_path / "task.py"
+    code.write_text("raise SystemExit('a name in a file of a stranger was run')")
+    stranger = {"collection": {"task": str(code), "steps": 1, "seed": 0}}
+    (folder / "data" / "metadata.json").write_text(json.dumps(stranger))
     assert collection_command(folder) is None
     assert collection_command(tmp_path) is None

@@ -131,7 +131,7 @@ def test_after_giving_up_a_second_call_goes_on(server: Server, tmp_path: Path, m
     monkeypatch.setattr(downloading, "ATTEMPTS", 1)
     server.cuts, server.cut_after = 1, 120_000
     with pytest.raises(
-        UserError, match=r"120,000 of 300,008 bytes came\); the 120,000 bytes that came are kept, the sa"
+        UserError, match=r"120,000 of 300,008 bytes arrived\); the 120,000 bytes that arrived are kept, and the sa"
     ):
         download(f"{server.url}/file.hdf5", tmp_path / "file.hdf5")
     assert _left(tmp_path) == ["file.hdf5.part", "file.hdf5.part.json"]
@@ -190,14 +190,16 @@ def test_a_part_of_something_else_is_not_gone_on_with(facts: str | None, server:
 
 def test_fewer_bytes_than_announced_are_no_file(server: Server, tmp_path: Path) -> None:
     server.announce = 50
-    with pytest.raises(UserError, match=r"file.hdf5 cannot be read \(.*; the .* bytes that came are kept"):
+    with pytest.raises(UserError, match=r"file.hdf5 cannot be read \(.*; the .* bytes that arrived are kept"):
         download(f"{server.url}/file.hdf5", tmp_path / "file.hdf5")
     assert not (tmp_path / "file.hdf5").exists()
 
 
 def test_another_page_in_its_place_is_deleted(server: Server, tmp_path: Path) -> None:
     server.files["/file.hdf5"] = b"<html>Log in to the network</html>"
-    with pytest.raises(UserError, match=r"sent is no HDF5 file \(it begins with b'<html>Lo'\) and was deleted"):
+    with pytest.raises(
+        UserError, match=r"sent something other than an HDF5 file, which was deleted; it began with b'<html>Lo'"
+    ):
         download(f"{server.url}/file.hdf5", tmp_path / "file.hdf5")
     assert not list(tmp_path.glob("*.part"))
 
@@ -301,7 +303,7 @@ def test_a_path_that_is_not_there_is_named_with_what_is(tmp_path: Path) -> None:
 def test_a_task_without_data_there_says_what_it_has() -> None:
     with pytest.raises(UserError, match=r"task 'pointmaze-large-play' has no data set in source 'd4rl'; it has local:"):
         fetch("pointmaze-large-play")
-    with pytest.raises(UserError, match="source: found 'elsewhere', expected d4rl or minari"):
+    with pytest.raises(UserError, match="source: got 'elsewhere', expected d4rl or minari"):
         fetch("hopper-medium", "elsewhere")
 
 
@@ -344,5 +346,5 @@ def test_minaris_metadata_are_checked_before_the_rest_is_fetched(
 
 
 def test_an_id_that_leaves_the_folder_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"'\.\./\.\./evil' is no Minari id"):
+    with pytest.raises(UserError, match=r"'\.\./\.\./evil' is not a Minari id"):
         fetch_minari("../../evil", tmp_path)

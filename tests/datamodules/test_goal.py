@@ -91,5 +91,5 @@ def test_recorded_arrivals_cut_as_the_goal_itself_does(places: str) -> None:
 
 def test_rewards_that_do_not_say_where_the_goal_is_are_refused() -> None:
     data = Trajectories.from_episodes("walk", [_walk("OOI")])
-    with pytest.raises(DataError, match=r"'walk', rewards: found 0.5, expected 0 or 1 \(on the goal\) for task"):
+    with pytest.raises(DataError, match=r"'walk', rewards: got 0.5, expected 0 or 1 \(on the goal\) for task"):
         cut_at_arrivals(data, TASK)

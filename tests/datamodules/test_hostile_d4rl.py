@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,9 +14,9 @@ from datamodules import load_trajectories
 from datamodules.trajectories import DataError
 from dds_lightning.tasks import get_task
 from tests.recordings import Episode, d4rl_rows, record, write_d4rl_file
+from tests.spoiling import Spoil, declare, replace
 
 HOPPER = "hopper-medium"
-Spoil = Callable[[h5py.File], Any]
 
 
 @cache
@@ -29,30 +28,9 @@ def _rows(name: str = HOPPER) -> dict[str, Any]:
     return d4rl_rows(get_task(name), _recorded(name))
 
 
-def _set(key: str, value: Any, **options: Any) -> Spoil:
-    def spoil(file: h5py.File) -> None:
-        del file[key]
-        if isinstance(value, h5py.SoftLink | h5py.ExternalLink):
-            file[key] = value
-        else:
-            file.create_dataset(key, data=value, **options)
-
-    return spoil
-
-
 def _put(key: str, index: Any, value: Any) -> Spoil:
     def spoil(file: h5py.File) -> None:
         file[key][index] = value
-
-    return spoil
-
-
-def _declare(key: str, shape: tuple[int, ...], dtype: Any = "f4", **options: Any) -> Spoil:
-    """Declare an array and write nothing into it."""
-
-    def spoil(file: h5py.File) -> None:
-        del file[key]
-        file.create_dataset(key, shape=shape, dtype=dtype, **options)
 
     return spoil
 
@@ -132,25 +110,28 @@ SPOILT: dict[str, tuple[Spoil, str]] = {
     "no rewards": (lambda f: f.pop("rewards"), "'rewards' is missing; found actions, infos, observations"),
     "no observations": (lambda f: f.pop("observations"), "'observations' is missing; found actions"),
     "empty": (lambda f: [f.pop(key) for key in list(f)], "'observations' is missing; found nothing"),
-    "Minari's layout": (_minari, "laid out as Minari's files are, one group an episode; read it with local:DIR"),
-    "a group for an array": (_group, "observations: found a group, expected an array"),
-    "flat observations": (_set("observations", np.zeros(660)), r"observations: found shape \(660,\), expected"),
+    "Minari's layout": (_minari, "it has the layout of Minari's files, one group per episode; read it with local:DIR"),
+    "a group for an array": (_group, "observations: got a group, expected an array"),
+    "flat observations": (replace("observations", np.zeros(660)), r"observations: got shape \(660,\), expected"),
     "two-dimensional rewards": (
-        _set("rewards", np.zeros((60, 2))),
-        r"rewards: found shape \(60, 2\), expected \(rows,\)",
+        replace("rewards", np.zeros((60, 2))),
+        r"rewards: got shape \(60, 2\), expected \(rows,\)",
     ),
-    "one number for an array": (_set("rewards", 1.0), "rewards: found one value, expected an array"),
-    "nothing for an array": (_set("rewards", h5py.Empty("f4")), "rewards: found nothing, expected an array"),
-    "no rows": (lambda f: [_set(k, f[k][:0])(f) for k in list(f) if k != "infos"], "rewards: found 0 rows, expected"),
-    "an action too few": (_set("actions", np.zeros((59, 3))), "actions: found 59 rows, but rewards has 60"),
-    "a flag too few": (_set("timeouts", np.zeros(59, bool)), "timeouts: found 59 rows, but rewards has 60"),
+    "one number for an array": (replace("rewards", 1.0), "rewards: got one value, expected an array"),
+    "nothing for an array": (replace("rewards", h5py.Empty("f4")), "rewards: got nothing, expected an array"),
+    "no rows": (
+        lambda f: [replace(k, f[k][:0])(f) for k in list(f) if k != "infos"],
+        "rewards: got 0 rows, expected",
+    ),
+    "an action too few": (replace("actions", np.zeros((59, 3))), "actions: got 59 rows, but rewards has 60"),
+    "a flag too few": (replace("timeouts", np.zeros(59, bool)), "timeouts: got 59 rows, but rewards has 60"),
     "another task's widths": (
-        _set("observations", np.zeros((60, 17))),
-        r"observations: found shape \(60, 17\), expected \(rows, 11\) as task 'hopper-medium' has it",
+        replace("observations", np.zeros((60, 17))),
+        r"observations: got shape \(60, 17\), expected \(rows, 11\) as task 'hopper-medium' has it",
     ),
     "next observations of another width": (
         lambda f: f.create_dataset("next_observations", data=np.zeros((60, 10))),
-        r"next_observations: found shape \(60, 10\), expected \(rows, 11\)",
+        r"next_observations: got shape \(60, 10\), expected \(rows, 11\)",
     ),
     "next observations of other rows": (
         lambda f: f.create_dataset("next_observations", data=f["observations"][:]),
@@ -158,55 +139,55 @@ SPOILT: dict[str, tuple[Spoil, str]] = {
     ),
     "not a number": (
         _put("observations", (7, 3), np.nan),
-        "observations: found nan at row 7, column 3, expected finite",
+        "observations: got nan at row 7, column 3, expected finite",
     ),
-    "infinite reward": (_put("rewards", 9, np.inf), "rewards: found inf at row 9, expected finite"),
-    "too large for 32 bits": (_set("rewards", np.full(60, 1e300)), r"rewards: found 1e\+300 at row 0"),
+    "infinite reward": (_put("rewards", 9, np.inf), "rewards: got inf at row 9, expected finite"),
+    "too large for 32 bits": (replace("rewards", np.full(60, 1e300)), r"rewards: got 1e\+300 at row 0"),
     "outside the box": (
         _put("actions", (11, 2), 1.5),
-        "actions: found 1.5 at row 11, column 2, expected -1 to 1",
+        "actions: got 1.5 at row 11, column 2, expected -1 to 1",
     ),
-    "odd flags": (_set("terminals", np.full(60, 0.5)), "terminals: found 0.5 at row 0, expected 0 or 1"),
+    "odd flags": (replace("terminals", np.full(60, 0.5)), "terminals: got 0.5 at row 0, expected 0 or 1"),
     "flags that are no numbers": (
-        _set("terminals", np.full(60, np.nan)),
-        "terminals: found nan at row 0, expected 0 or 1",
+        replace("terminals", np.full(60, np.nan)),
+        "terminals: got nan at row 0, expected 0 or 1",
     ),
-    "text": (_set("rewards", np.array([b"x"] * 60)), "rewards: found values of type .S1, expected real numbers"),
+    "text": (replace("rewards", np.array([b"x"] * 60)), "rewards: got values of type .S1, expected real numbers"),
     "objects": (
-        _set("observations", np.array(["os.system('true')"] * 60, object), dtype=h5py.string_dtype()),
-        "observations: found values of type object, expected real numbers",
+        replace("observations", np.array(["os.system('true')"] * 60, object), dtype=h5py.string_dtype()),
+        "observations: got values of type object, expected real numbers",
     ),
     "ragged": (
-        _declare("actions", (60,), h5py.vlen_dtype(np.float32)),
-        "actions: found values of type object, expected real numbers",
+        declare("actions", (60,), h5py.vlen_dtype(np.float32)),
+        "actions: got values of type object, expected real numbers",
     ),
     "compound": (
-        _set("rewards", np.zeros(60, [("a", "f4"), ("b", "i4")])),
-        r"rewards: found values of type \[\('a'.*expected real numbers",
+        replace("rewards", np.zeros(60, [("a", "f4"), ("b", "i4")])),
+        r"rewards: got values of type \[\('a'.*expected real numbers",
     ),
-    "opaque": (_set("rewards", np.zeros(60, "V8")), "rewards: found values of type .V8, expected real numbers"),
-    "complex": (_set("rewards", np.zeros(60, complex)), "rewards: found values of type complex128, expected"),
-    "arrays in arrays": (_declare("rewards", (60,), np.dtype("(2,)f4")), "rewards: found values of type .*expected"),
-    "references": (_references, "actions: found values of type object, expected real numbers"),
-    "a soft link": (_set("rewards", h5py.SoftLink("/infos/qpos")), "'rewards' is a link to elsewhere"),
+    "opaque": (replace("rewards", np.zeros(60, "V8")), "rewards: got values of type .V8, expected real numbers"),
+    "complex": (replace("rewards", np.zeros(60, complex)), "rewards: got values of type complex128, expected"),
+    "arrays in arrays": (declare("rewards", (60,), np.dtype("(2,)f4")), "rewards: got values of type .*expected"),
+    "references": (_references, "actions: got values of type object, expected real numbers"),
+    "a soft link": (replace("rewards", h5py.SoftLink("/infos/qpos")), "'rewards' is a link to elsewhere"),
     "a link to another file": (
-        _set("rewards", h5py.ExternalLink("elsewhere.hdf5", "/rewards")),
+        replace("rewards", h5py.ExternalLink("elsewhere.hdf5", "/rewards")),
         "'rewards' is a link to elsewhere",
     ),
-    "a link to itself": (_set("rewards", h5py.SoftLink("/rewards")), "'rewards' is a link to elsewhere"),
+    "a link to itself": (replace("rewards", h5py.SoftLink("/rewards")), "'rewards' is a link to elsewhere"),
     "bytes of another file": (_external, "'rewards' is stored in another file"),
     "a virtual array": (_virtual, "'observations' is stored in another file"),
     "a plug-in": (_plugin, "actions: it is stored with filter 32001, which needs a plug-in, and plug-ins are foreign"),
     "more than the file holds": (
-        _declare("observations", (10**13, 11), chunks=(10**6, 11)),
+        declare("observations", (10**13, 11), chunks=(10**6, 11)),
         r"observations: it declares shape \(10000000000000, 11\), 440 TB, but its file holds 0 bytes of it",
     ),
     "declared, not written": (
-        _declare("observations", (60, 11)),
+        declare("observations", (60, 11)),
         r"observations: it declares shape \(60, 11\), 2.64 kB, but its file holds 0 bytes of it",
     ),
     "declared in blocks, not written": (
-        _declare("observations", (60, 11), chunks=(20, 11)),
+        declare("observations", (60, 11), chunks=(20, 11)),
         "observations: it declares shape .* in 3 blocks, but its file holds 0 of them",
     ),
     "a hole": (_hole, "observations: it declares shape .* in 3 blocks, but its file holds 2 of them"),
@@ -215,7 +196,7 @@ SPOILT: dict[str, tuple[Spoil, str]] = {
     "no ends": (_no_ends, "terminals: none of the 60 rows is marked as an episode's last, .* no complete episode"),
     "nothing but ends": (
         lambda f: (_put("timeouts", slice(None), True)(f), _put("terminals", slice(None), False)(f)),
-        "observations: no row leads to another one, so it holds no complete episode",
+        "observations: no row leads to another one, so it has no complete episode",
     ),
 }
 
@@ -256,7 +237,7 @@ def test_a_truncated_file_is_refused(keep: float, tmp_path: Path) -> None:
 def test_what_is_no_hdf5_is_refused(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "page.hdf5"
     path.write_bytes(content)
-    with pytest.raises(DataError, match=r"page.hdf5 is truncated or damaged, or no HDF5 file at all"):
+    with pytest.raises(DataError, match=r"page.hdf5 is truncated or damaged, or not an HDF5 file at all"):
         load_trajectories(f"d4rl:{path}", HOPPER)
 
 
@@ -286,11 +267,11 @@ def test_random_changes_of_bytes_load_or_are_refused_in_a_sentence(tmp_path: Pat
 
 OTHERS = {
     "another maze": ("antmaze-large-play", "antmaze-umaze", "of the positions lie outside the corridors of task"),
-    "another physics": ("antmaze-umaze@robotics", "antmaze-umaze", "of another physics with other coordinates"),
+    "another physics": ("antmaze-umaze@robotics", "antmaze-umaze", "of other physics with other coordinates"),
     "another body of the same widths": ("halfcheetah-medium", "walker2d-medium", "median height is .* another body"),
     "the other way round": ("walker2d-medium", "halfcheetah-medium", "median height is .* another body"),
     "other subtasks": ("kitchen-mixed", "kitchen-partial", "column 41, but the goal of task 'kitchen-partial'"),
-    "other widths": ("kitchen-mixed", "antmaze-umaze", r"found shape \(60, 60\), expected \(rows, 29\) as task"),
+    "other widths": ("kitchen-mixed", "antmaze-umaze", r"got shape \(60, 60\), expected \(rows, 29\) as task"),
 }
 
 

@@ -82,13 +82,13 @@ METADATA: dict[str, tuple[Change, str]] = {
     "vector entry point": (_spec(vector_entry_point=PAYLOAD), f"env_spec names the code '{PAYLOAD}', expected none"),
     "wrapper": (
         _spec(additional_wrappers=_wrapper(PAYLOAD)),
-        f"env_spec names the code '{PAYLOAD}', expected no wrapp",
+        f"env_spec names the code '{PAYLOAD}', expected only wrapp",
     ),
     "wrapper that changes rewards": (
         _spec(additional_wrappers=_wrapper("gymnasium.wrappers.transform_reward:ClipReward")),
         "names the code 'gymnasium.wrappers.transform_reward:ClipReward'",
     ),
-    "wrapper that is no object": (_spec(additional_wrappers=["w"]), "names the code 'w'"),
+    "wrapper that is not an object": (_spec(additional_wrappers=["w"]), "names the code 'w'"),
     "wrappers that are no list": (_spec(additional_wrappers={"a": 1}), "env_spec in metadata.json is damaged"),
     "entry point for evaluation": (_evaluation(entry_point=PAYLOAD), f"eval_env_spec names the code '{PAYLOAD}'"),
     "wrapper for evaluation": (
@@ -109,13 +109,16 @@ METADATA: dict[str, tuple[Change, str]] = {
         f"recorded in AntMaze_Large-v4, but task '{MAZE}' needs PointMaze_Large-v3",
     ),
     "no environment": (_entries(env_spec=None), "has no env_spec, so nothing says that it was recorded in PointMaze"),
-    "damaged environment": (_entries(env_spec="[]"), r"env_spec in metadata.json is damaged: it holds \[\]"),
+    "damaged environment": (
+        _entries(env_spec="[]"),
+        r"env_spec in metadata.json is damaged: expected a JSON object, got \[\]",
+    ),
     "other model": (
         _spec(kwargs={"xml_file": "/home/somebody/point.xml"}),
-        "recorded with the argument xml_file = '/home/somebody/point.xml', so in other physics",
+        "recorded with the argument xml_file = '/home/somebody/point.xml', so with other physics",
     ),
     "other time step": (_spec(kwargs={"frame_skip": 10}), "recorded with the argument frame_skip = 10"),
-    "arguments that are no object": (_spec(kwargs=[1]), "its kwargs or additional_wrappers are no object"),
+    "arguments that are not an object": (_spec(kwargs=[1]), "expected an object for kwargs"),
     "other walls": (
         _spec(kwargs={"maze_map": [[1, 1, 1], [1, "c", 1], [1, 1, 1]]}),
         rf"other walls \('?111/101/111'?\) than task '{MAZE}'",
@@ -155,8 +158,8 @@ METADATA: dict[str, tuple[Change, str]] = {
     ),
     "discrete actions": (_space("action_space", type="Discrete", n=3), "expected a bounded Box"),
     # the file
-    "no JSON": (_text("env_spec: os.system"), "metadata.json is damaged: it holds no JSON object"),
-    "a list": (_text("[1, 2]"), r"metadata.json is damaged: it holds \[1, 2\], expected a JSON object"),
+    "no JSON": (_text("env_spec: os.system"), "metadata.json is damaged: it is not a JSON object"),
+    "a list": (_text("[1, 2]"), r"metadata.json is damaged: expected a JSON object, got \[1, 2\]"),
     "deep JSON": (_text('{"a":' * 100_000), "metadata.json is damaged"),
     "huge JSON": (
         _text("[" + "0," * MAX_BYTES + "0]"),
@@ -165,9 +168,9 @@ METADATA: dict[str, tuple[Change, str]] = {
     "no text": (_text(b"\x89HDF\r\n\x1a\n\xff"), "metadata.json is damaged"),
     "a number of a million digits": (_text('{"total_steps": ' + "9" * 1_000_000 + "}"), "metadata.json is damaged"),
     "other format": (_entries(data_format="arrow"), "data_format is 'arrow', expected 'hdf5'"),
-    "episodes hidden": (_entries(total_episodes=1), "promises 1 episodes, but .* holds 2"),
-    "episodes invented": (_entries(total_episodes=10**12), "promises 1000000000000 episodes, but .* holds 2"),
-    "steps invented": (_entries(total_steps=41), "promises 41 steps, but .* holds 40"),
+    "episodes hidden": (_entries(total_episodes=1), "promises 1 episodes, but .* has 2"),
+    "episodes invented": (_entries(total_episodes=10**12), "promises 1000000000000 episodes, but .* has 2"),
+    "steps invented": (_entries(total_steps=41), "promises 41 steps, but .* has 40"),
     "negative episodes": (_entries(total_episodes=-2), "total_episodes in metadata.json is -2, expected a count"),
     "steps in words": (_entries(total_steps="many"), "total_steps in metadata.json is 'many', expected a count"),
     "orders to the terminal": (_entries(data_format="\x1b[2J\nhdf5" * 100), "data_format is '.x1b.*, expected 'hdf5'"),
@@ -184,7 +187,7 @@ def test_metadata_are_not_trusted(case: str, maze_set: Path, sentinel: Path) -> 
 @pytest.mark.parametrize("argument", ["frame_skip", "xml_file", "maze_height"])
 def test_what_changes_the_physics_is_refused_without_a_task_too(argument: str, maze_set: Path) -> None:
     _spec(kwargs={argument: 1})(maze_set)
-    with pytest.raises(DataError, match=rf"argument {argument} = 1, .* takes none of the name '{argument}'"):
+    with pytest.raises(DataError, match=rf"argument {argument} = 1, .* has no argument '{argument}'"):
         load_trajectories(f"local:{maze_set}")
 
 
@@ -204,5 +207,5 @@ def test_a_name_that_is_a_path_names_nothing(name: Any, maze_set: Path) -> None:
 @pytest.mark.parametrize("name", ["../sets/set-v0", "..", "/etc", "a/../set-v0", "set-v0/", "set v0", "set-v0\n"])
 def test_an_id_that_is_a_path_is_refused(name: str, maze_set: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(maze_set.parent))
-    with pytest.raises(UserError, match="is no Minari id"):
+    with pytest.raises(UserError, match="is not a Minari id"):
         load_trajectories(f"minari:{name}", MAZE)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -13,29 +12,7 @@ import pytest
 from dds_lightning.tasks import get_task
 from tests.minari_recordings import write_minari_set
 from tests.refusals import MAZE, STEPS, maze_episodes, refuse
-
-Spoil = Callable[[h5py.File], Any]
-
-
-def _set(key: str, value: Any, **options: Any) -> Spoil:
-    def spoil(file: h5py.File) -> None:
-        del file[key]
-        if isinstance(value, (h5py.SoftLink, h5py.ExternalLink, h5py.HardLink, np.dtype, h5py.VirtualLayout)):
-            file[key] = value
-        else:
-            file.create_dataset(key, data=value, **options)
-
-    return spoil
-
-
-def _declare(key: str, shape: tuple[int, ...], dtype: Any = "f4", **options: Any) -> Spoil:
-    """Declare an array and write nothing into it."""
-
-    def spoil(file: h5py.File) -> None:
-        del file[key]
-        file.create_dataset(key, shape=shape, dtype=dtype, **options)
-
-    return spoil
+from tests.spoiling import Spoil, declare, replace
 
 
 def _virtual(file: h5py.File) -> None:
@@ -80,63 +57,66 @@ REWARDS = "episode_1/rewards"
 FILES: dict[str, tuple[Spoil, str]] = {
     # elsewhere
     "external link": (
-        _set(REWARDS, h5py.ExternalLink("else.hdf5", "/x")),
+        replace(REWARDS, h5py.ExternalLink("else.hdf5", "/x")),
         "episode_1: 'rewards' is a link to elsewhere",
     ),
-    "external link to an episode": (_set("episode_1", h5py.ExternalLink("else.hdf5", "/x")), "'episode_1' is a link"),
-    "soft link": (_set("episode_1", h5py.SoftLink("/episode_0")), "'episode_1' is a link to elsewhere"),
-    "soft link into nothing": (_set(REWARDS, h5py.SoftLink("/nowhere")), "'rewards' is a link to elsewhere"),
+    "external link to an episode": (
+        replace("episode_1", h5py.ExternalLink("else.hdf5", "/x")),
+        "'episode_1' is a link",
+    ),
+    "soft link": (replace("episode_1", h5py.SoftLink("/episode_0")), "'episode_1' is a link to elsewhere"),
+    "soft link into nothing": (replace(REWARDS, h5py.SoftLink("/nowhere")), "'rewards' is a link to elsewhere"),
     "link in the observations": (
-        _set("episode_1/observations/observation", h5py.SoftLink("/episode_0/observations/observation")),
+        replace("episode_1/observations/observation", h5py.SoftLink("/episode_0/observations/observation")),
         "episode_1, observations: 'observation' is a link to elsewhere",
     ),
     "external storage": (
-        _declare(REWARDS, (STEPS,), "f8", external=OUTSIDE),
+        declare(REWARDS, (STEPS,), "f8", external=OUTSIDE),
         "'rewards' is stored in another file",
     ),
     "virtual dataset": (_virtual, "'rewards' is stored in another file"),
-    "observations that hold themselves": (_loop, "found the entries actions, .* expected 'observation'"),
+    "observations that hold themselves": (_loop, "got the entries actions, .* expected 'observation'"),
     # types
     "objects": (
-        _set(REWARDS, np.array([np.arange(2.0)] * STEPS + [None], object)[:-1], dtype=h5py.vlen_dtype(np.float64)),
-        "episode_1, rewards: found values of type object, expected real numbers",
+        replace(REWARDS, np.array([np.arange(2.0)] * STEPS + [None], object)[:-1], dtype=h5py.vlen_dtype(np.float64)),
+        "episode_1, rewards: got values of type object, expected real numbers",
     ),
-    "strings": (_set(REWARDS, ["os.system"] * STEPS), "rewards: found values of type object, expected real numbers"),
-    "short strings": (_set(REWARDS, np.array([b"0"] * STEPS)), r"rewards: found values of type \|S1"),
-    "references": (_declare(REWARDS, (STEPS,), h5py.ref_dtype), "rewards: found values of type object"),
-    "pickles": (_set(REWARDS, np.array([b"\x80\x04."] * STEPS, "V3")), r"rewards: found values of type \|V3"),
-    "records": (_set(REWARDS, np.zeros(STEPS, [("r", "f4"), ("x", "i4")])), "rewards: found values of type"),
-    "complex numbers": (_set(REWARDS, np.zeros(STEPS, complex)), "rewards: found values of type"),
-    "a type for an array": (_set(REWARDS, np.dtype("f8")), "rewards: found a group, expected an array"),
+    "strings": (replace(REWARDS, ["os.system"] * STEPS), "rewards: got values of type object, expected real numbers"),
+    "short strings": (replace(REWARDS, np.array([b"0"] * STEPS)), r"rewards: got values of type \|S1"),
+    "references": (declare(REWARDS, (STEPS,), h5py.ref_dtype), "rewards: got values of type object"),
+    "pickles": (replace(REWARDS, np.array([b"\x80\x04."] * STEPS, "V3")), r"rewards: got values of type \|V3"),
+    "records": (replace(REWARDS, np.zeros(STEPS, [("r", "f4"), ("x", "i4")])), "rewards: got values of type"),
+    "complex numbers": (replace(REWARDS, np.zeros(STEPS, complex)), "rewards: got values of type"),
+    "a type for an array": (replace(REWARDS, np.dtype("f8")), "rewards: got a group, expected an array"),
     "names that a terminal obeys": (_orders, r"episode_1: 'rewards' is missing; found \?\[2J"),
-    "a group for an array": (_group, "rewards: found a group, expected an array"),
-    "an array for an episode": (_set("episode_1", np.zeros(3)), "episode_1: found an array, expected a group"),
+    "a group for an array": (_group, "rewards: got a group, expected an array"),
+    "an array for an episode": (replace("episode_1", np.zeros(3)), "episode_1: got an array, expected a group"),
     "an array for observations": (
-        _set("episode_1/observations", np.zeros((STEPS + 1, 4))),
-        "episode_1, observations: found an array, expected a group",
+        replace("episode_1/observations", np.zeros((STEPS + 1, 4))),
+        "episode_1, observations: got an array, expected a group",
     ),
     # sizes
     "a size beyond the file": (
-        _declare(REWARDS, (10**15,), "f8"),
+        declare(REWARDS, (10**15,), "f8"),
         "rewards: it declares shape .* but its file holds 0 bytes of it",
     ),
     "packed beyond belief": (
-        _declare("episode_1/actions", (10**12, 2), chunks=(10**6, 2), compression="gzip"),
-        "actions: it declares shape .* is not believed",
+        declare("episode_1/actions", (10**12, 2), chunks=(10**6, 2), compression="gzip"),
+        "actions: it declares shape .* is not plausible",
     ),
-    "never written": (_declare(REWARDS, (STEPS,), "f8"), "rewards: it declares shape .* its file holds 0 bytes of it"),
+    "never written": (declare(REWARDS, (STEPS,), "f8"), "rewards: it declares shape .* its file holds 0 bytes of it"),
     "a chunk never written": (_hole, "rewards: it declares shape .* in 2 blocks, but its file holds 1 of them"),
     "a filter from a plug-in": (_plugin, "rewards: it is stored with filter 32099, which needs a plug-in"),
-    "one number": (_set(REWARDS, 0.0), "rewards: found one value, expected an array"),
-    "no numbers": (_set(REWARDS, h5py.Empty("f8")), "rewards: found nothing, expected an array"),
-    "no steps": (_set("episode_1/rewards", np.zeros(0)), "promises 40 steps, but .* holds 20"),
+    "one number": (replace(REWARDS, 0.0), "rewards: got one value, expected an array"),
+    "no numbers": (replace(REWARDS, h5py.Empty("f8")), "rewards: got nothing, expected an array"),
+    "no steps": (replace("episode_1/rewards", np.zeros(0)), "promises 40 steps, but .* has 20"),
     "three axes": (
-        _set("episode_1/observations/observation", np.zeros((STEPS + 1, 4, 1))),
-        r"observations/observation: found shape \(21, 4, 1\), expected \(steps, 4\)",
+        replace("episode_1/observations/observation", np.zeros((STEPS + 1, 4, 1))),
+        r"observations/observation: got shape \(21, 4, 1\), expected \(steps, 4\)",
     ),
     "another task's width": (
-        _set("episode_1/observations/observation", np.zeros((STEPS + 1, 27))),
-        r"observations/observation: found shape \(21, 27\), expected \(steps, 4\)",
+        replace("episode_1/observations/observation", np.zeros((STEPS + 1, 27))),
+        r"observations/observation: got shape \(21, 27\), expected \(steps, 4\)",
     ),
 }
 

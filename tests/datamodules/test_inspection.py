@@ -53,9 +53,9 @@ def test_checking_refuses_what_loading_refuses(minari_set: Callable[..., Path]) 
         file["episode_0/rewards"][3] = np.inf
 
     folder = minari_set(spoil=spoil)
-    with pytest.raises(DataError, match="'set-v0', episode_0, rewards: found inf at step 3"):
+    with pytest.raises(DataError, match="'set-v0', episode_0, rewards: got inf at step 3"):
         check_dataset(f"local:{folder}", LARGE)
-    with pytest.raises(DataError, match="'set-v0', episode_0, rewards: found inf at step 3"):
+    with pytest.raises(DataError, match="'set-v0', episode_0, rewards: got inf at step 3"):
         check_dataset(f"local:{folder}")
 
 

@@ -179,7 +179,7 @@ def test_a_mixed_set_is_refused_for_partial_naming_both(tmp_path: Path) -> None:
     with pytest.raises(
         DataError,
         match="'kitchen-mixed-v0' was recorded for the subtasks microwave, kettle, bottom burner, light switch, "
-        "but task 'kitchen-partial' has microwave, kettle, light switch, slide cabinet; choose the task",
+        "but task 'kitchen-partial' has microwave, kettle, light switch, slide cabinet; choose a task",
     ):
         load_trajectories(f"local:{folder}", "kitchen-partial")
 

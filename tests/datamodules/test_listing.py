@@ -72,9 +72,9 @@ def test_broken_d4rl_files_are_listed_with_their_problem(tmp_path: Path) -> None
         file["observations"] = h5py.ExternalLink("lacking.hdf5", "observations")
         file["actions"], file["terminals"] = np.zeros((5, 3), np.float32), np.zeros(5, bool)
     problems = find_datasets([tmp_path]).set_index("data set")["problem"]
-    assert "no HDF5 file" in problems["text.hdf5"]
+    assert "not an HDF5 file" in problems["text.hdf5"]
     assert "'actions' is missing" in problems["lacking.hdf5"]
-    assert "found 4 rows, but terminals has 5" in problems["uneven.hdf5"]
+    assert "got 4 rows, but terminals has 5" in problems["uneven.hdf5"]
     assert "link" in problems["linked.hdf5"]
 
 

@@ -39,13 +39,13 @@ def test_by_id_from_minaris_folder(minari_set: Write, monkeypatch: pytest.Monkey
     assert load_trajectories("minari:set-v0", LARGE).num_steps == 24
     with pytest.raises(DataError, match=r"data set 'other-v0' is not in .*dds data collect"):
         load_trajectories("minari:other-v0", LARGE)
-    with pytest.raises(UserError, match="is no Minari id"):
+    with pytest.raises(UserError, match="is not a Minari id"):
         load_trajectories("minari:../set-v0", LARGE)
 
 
 @pytest.mark.parametrize("spec", ["", "local", "local:", "http://somewhere", "nowhere:x"])
 def test_an_unknown_source_lists_those_there_are(spec: str) -> None:
-    with pytest.raises(UserError, match=r"data is '.*', expected one of .*local:..., .*minari:..., .*arrays:..."):
+    with pytest.raises(UserError, match=r"data: got .*, expected one of local:DIR .*minari:ID .*arrays:DIR"):
         load_trajectories(spec, LARGE)
 
 
@@ -54,7 +54,7 @@ def test_a_set_of_another_task_is_refused_naming_both(minari_set: Write) -> None
     with pytest.raises(
         DataError,
         match=r"data 'local:.*set-v0' were recorded in PointMaze_Medium-v3, but task 'pointmaze-large-diverse' needs "
-        "PointMaze_Large-v3; choose the task that fits the data, or other data",
+        "PointMaze_Large-v3; choose a task that fits the data, or other data",
     ):
         load_trajectories(f"local:{folder}", LARGE)
 
@@ -84,37 +84,37 @@ def _nan(file: h5py.File) -> None:
 
 
 SPOILT: dict[str, tuple[Callable[[h5py.File], None], str]] = {
-    "not a number": (_nan, "episode_1, observations: found nan at step 4, column 2"),
+    "not a number": (_nan, "episode_1, observations: got nan at step 4, column 2"),
     "wrong width": (
         _set("episode_1/observations/observation", np.zeros((13, 3))),
-        r"episode_1, observations/observation: found shape \(13, 3\), expected \(steps, 4\)",
+        r"episode_1, observations/observation: got shape \(13, 3\), expected \(steps, 4\)",
     ),
     "T observations": (
         _set("episode_0/observations/observation", np.zeros((12, 4))),
-        r"episode_0, observations: found 12 rows, expected 13",
+        r"episode_0, observations: got 12 rows, expected 13",
     ),
     "no end": (_set("episode_1/truncations", np.zeros(12, bool)), "episode_1: never ends"),
     "outside the box": (
         _set("episode_0/actions", np.full((12, 2), 3.0)),
-        "episode_0, actions: found 3 at step 0, column 0, expected -1 to 1",
+        "episode_0, actions: got 3 at step 0, column 0, expected -1 to 1",
     ),
     "no rewards": (_delete("episode_1/rewards"), "episode_1: 'rewards' is missing; found actions"),
     "no observation": (
         _delete("episode_1/observations/observation"),
-        "episode_1, observations: found the entries desired_goal, expected 'observation'",
+        "episode_1, observations: got the entries desired_goal, expected 'observation'",
     ),
     "an array for an episode": (
         _set("episode_1", np.zeros(3)),
-        "episode_1: found an array, expected a group",
+        "episode_1: got an array, expected a group",
     ),
-    "a gap": (_delete("episode_0"), "promises 2 episodes, but .* holds 1"),
+    "a gap": (_delete("episode_0"), "promises 2 episodes, but .* has 1"),
     "another name": (
         lambda file: file.move("episode_1", "episode_7"),
         "main_data.hdf5 has 2 episodes, but no episode_1",
     ),
     "parts of different length": (
         _set("episode_1/observations/observation", np.zeros((12, 4))),
-        "episode_1, observations: found 12 rows, expected 13",
+        "episode_1, observations: got 12 rows, expected 13",
     ),
 }
 
@@ -156,7 +156,7 @@ def test_recorded_rewards_can_be_kept(minari_set: Write) -> None:
     folder = minari_set(spoil=_set("episode_0/rewards", np.ones(12)))
     assert load_trajectories(f"local:{folder}", LARGE, reward="recorded").rewards.sum() == 12
     assert load_trajectories(f"local:{folder}", LARGE).rewards.sum() == 0
-    with pytest.raises(UserError, match="reward: found 'dense'"):
+    with pytest.raises(UserError, match="reward: got 'dense'"):
         load_trajectories(f"local:{folder}", LARGE, reward="dense")  # type: ignore[arg-type]
 
 
@@ -222,6 +222,9 @@ def test_other_versions_of_an_environment_choose_their_physics(
         assert node.shape[1:] == stored
     _same(load_trajectories(f"local:{folder}", name), episodes)
     assert resolve_task(f"local:{folder}", name).physics == variant
+    loaded = load_trajectories(f"local:{folder}", name)
+    assert loaded.task is not None
+    assert loaded.task.physics == variant
 
 
 @pytest.mark.parametrize("name", ["antmaze-umaze@robotics", "kitchen-mixed", "hopper-medium"])

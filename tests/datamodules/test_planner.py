@@ -45,7 +45,7 @@ def test_a_body_over_a_wall_is_sent_to_the_nearest_free_cell() -> None:
 
 
 def test_no_way_and_no_maze_are_errors() -> None:
-    with pytest.raises(UserError, match=r"no way from cell \(1, 1\) to cell \(1, 3\)"):
+    with pytest.raises(UserError, match=r"no path from cell \(1, 1\) to cell \(1, 3\)"):
         MazePlanner(("11111", "10101", "11111")).path((1, 1), (1, 3))
     with pytest.raises(UserError, match="equally long rows of 0 and 1"):
         MazePlanner(("111", "1g1", "11"))

@@ -1,20 +1,26 @@
 """Relabelling: rewards and ends worked out by hand, the cache refused when it does not match."""
 
+import hashlib
 import json
 import warnings
+from dataclasses import dataclass, fields
 
+import docstring_parser
 import numpy as np
 import pandas as pd
 import pytest
 import torch
+from jsonargparse import ArgumentParser
 from safetensors.torch import save_file
 
 import datamodules.relabel as relabelling
 from datamodules.relabel import Relabelled, relabel, relabel_key
 from datamodules.relabelled import RelabeledDataModule
+from datamodules.relabelling import Relabelling
 from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError
 from dds_lightning.skill import SkillModule
+from dds_lightning.tasks import get_task
 
 SMALL = {"hidden_dim": 16, "encoder_layers": 1, "encoder_heads": 2, "decoder_blocks": 1, "skill_dim": 8}
 
@@ -124,7 +130,7 @@ def test_saved_and_read_back_is_the_same(trajectories, skill, tmp_path):
 def test_a_file_that_is_something_else_is_refused(tmp_path, content):
     path = tmp_path / "r.safetensors"
     path.write_bytes(content)
-    with pytest.raises(UserError, match="no readable relabelled file"):
+    with pytest.raises(UserError, match="not a readable relabelled file"):
         Relabelled.load(path)
 
 
@@ -138,12 +144,15 @@ DAMAGES = {
     "no metadata": (lambda tensors, about: about.clear(), "KeyError"),
     "no number": (lambda tensors, about: about.update(num_skills="four"), "ValueError"),
     "a tensor too few": (lambda tensors, about: tensors.pop("dones"), "expected observations, codes"),
-    "a tensor too many": (lambda tensors, about: tensors.update(more=torch.zeros(1)), "it holds .*more"),
+    "a tensor too many": (lambda tensors, about: tensors.update(more=torch.zeros(1)), "it contains .*more"),
     "a row too few": (lambda tensors, about: tensors.update(rewards=torch.zeros(9)), r"rewards has shape \(9,\)"),
-    "another type": (lambda tensors, about: tensors.update(codes=torch.zeros(10)), "codes is of type torch.float32"),
+    "another type": (lambda tensors, about: tensors.update(codes=torch.zeros(10)), "codes has type torch.float32"),
     "a code too high": (lambda tensors, about: tensors["codes"].fill_(4), "codes run from 4 to 4, expected 0 to 3"),
     "a negative code": (lambda tensors, about: tensors["codes"].fill_(-1), "codes run from -1"),
-    "a reward that is none": (lambda tensors, about: tensors["rewards"].fill_(torch.nan), "rewards holds numbers"),
+    "a reward that is not a number": (
+        lambda tensors, about: tensors["rewards"].fill_(torch.nan),
+        "rewards contains numbers",
+    ),
 }
 
 
@@ -155,7 +164,7 @@ def test_a_damaged_file_is_refused_in_a_sentence(trajectories, skill, tmp_path, 
     change, message = DAMAGES[damage]
     change(tensors, about)
     save_file(tensors, tmp_path / "r.safetensors", metadata={"about": json.dumps(about)})
-    with pytest.raises(UserError, match=rf"r\.safetensors is no readable relabelled file .*{message}"):
+    with pytest.raises(UserError, match=rf"r\.safetensors is not a readable relabelled file .*{message}"):
         Relabelled.load(tmp_path / "r.safetensors")
 
 
@@ -265,3 +274,72 @@ def test_statistics_are_those_of_the_training_transitions(trajectories, skill, t
     rewards = data.transitions.rewards[data.train_index]
     assert statistics["reward_range"] == pytest.approx((rewards.min().item(), rewards.max().item()))
     assert statistics["max_discount"] == pytest.approx(0.99)
+
+
+# ---------------------------------------------------------------------- the settings in one record
+
+
+def test_every_setting_is_a_flag_with_its_help_part_of_the_key_and_kept_with_the_module(
+    trajectories, skill, tmp_path, capsys
+):
+    from dds_lightning.cli.parser import build_parser
+
+    with pytest.raises(SystemExit):
+        build_parser()[0].parse_args(["relabel", "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    documented = {one.arg_name: one.description for one in docstring_parser.parse(Relabelling.__doc__).params}
+    parser = ArgumentParser()
+    parser.add_class_arguments(RelabeledDataModule, "data")
+    defaults = parser.get_defaults().data
+    made = module(trajectories, skill, tmp_path)
+    for field in fields(Relabelling):
+        assert f"--{field.name}" in text
+        assert " ".join(documented[field.name].split()) in text
+        assert defaults[field.name] == field.default
+        assert made.hparams[field.name] == field.default
+        assert field.name in made.key
+
+
+def test_a_new_setting_is_one_more_field(trajectories, skill, tmp_path, monkeypatch):
+    @dataclass(frozen=True)
+    class Wider(Relabelling):
+        """Settings with one more.
+
+        Attributes:
+            cap: The greatest reward.
+        """
+
+        cap: float = 9.0
+
+    monkeypatch.setattr("datamodules.relabelled.Relabelling", Wider)
+    parser = ArgumentParser()
+    parser.add_class_arguments(RelabeledDataModule, "data")
+    assert parser.parse_args(["--data.cap=4", "--data.gamma=0.5"]).data.cap == 4.0
+    usual, capped = module(trajectories, skill, tmp_path), module(trajectories, skill, tmp_path, cap=4.0)
+    assert (usual.key["cap"], capped.key["cap"]) == (9.0, 4.0)
+    assert usual.cache_file() != capped.cache_file()
+    assert capped.settings["cap"] == capped.hparams.cap == 4.0
+    assert relabel(trajectories, skill, Wider(gamma=0.5, cap=4.0)).discounts[0] == 0.5
+
+
+def test_settings_are_given_as_a_record_by_name_or_both(trajectories, skill):
+    record = Relabelling(gamma=0.5, reward_shift=-1.0)
+    by_name = relabel(trajectories, skill, gamma=0.5, reward_shift=-1.0)
+    for made in (relabel(trajectories, skill, record), relabel(trajectories, skill, Relabelling(0.5), reward_shift=-1)):
+        assert torch.equal(made.rewards, by_name.rewards)
+    assert record.for_task(None) == Relabelling(0.5, reward_scale=1.0, reward_shift=-1.0)
+    ants = get_task("antmaze-umaze")
+    assert record.for_task(ants).reward_scale == ants.reward_scale
+    assert Relabelling().for_task(ants).reward_shift == ants.reward_shift
+    with pytest.raises(TypeError, match="gama"):
+        relabel(trajectories, skill, gama=0.5)
+
+
+def test_the_name_of_a_cached_file_is_that_of_earlier_versions(trajectories, skill, tmp_path):
+    """Caches made before stay valid: the key's entries and their order are part of the name."""
+    made = module(trajectories, skill, tmp_path, gamma=0.9)
+    key = {"data": trajectories.fingerprint(), "skill": skill.fingerprint(), "horizon": 3, "gamma": 0.9}
+    key |= {"discount": "per_skill", "stride": 1, "reward_scale": 1.0, "reward_shift": 0.0}
+    assert json.dumps(made.key) == json.dumps(key)
+    name = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:16]
+    assert made.cache_file().name == f"relabelled-{name}.safetensors"

@@ -124,9 +124,9 @@ def test_processes_share_an_epoch_without_overlap() -> None:
 
 def test_a_batch_larger_than_the_data_is_the_data() -> None:
     assert [len(b) for b in _epoch(_loader(batch_size=100, drop_last=True))] == [23]
-    with pytest.raises(UserError, match="batch_size: found 0"):
+    with pytest.raises(UserError, match="batch_size: got 0"):
         _loader(batch_size=0)
-    with pytest.raises(UserError, match="found 0 items for 1 processes"):
+    with pytest.raises(UserError, match="got 0 items for 1 processes"):
         _loader(size=0)
 
 
@@ -228,12 +228,12 @@ def test_memory_mapped_data_give_the_same_batches(data: Trajectories, tmp_path: 
 def test_the_task_alone_tells_the_shapes_and_how_to_get_data() -> None:
     module = SegmentDataModule(task="pointmaze-large-diverse")
     assert (module.observation_dim, module.action_dim) == (4, 2)
-    with pytest.raises(UserError, match=r"data: none was given for task .*`dds data collect pointmaze-large-diverse"):
+    with pytest.raises(UserError, match=r"data: none were given for task .*`dds data collect pointmaze-large-diverse"):
         module.setup()
 
 
 def test_neither_task_nor_data_is_an_error() -> None:
-    with pytest.raises(UserError, match="neither a task nor data were given"):
+    with pytest.raises(UserError, match="expected a task or data, got neither"):
         SegmentDataModule().setup()
 
 
@@ -241,11 +241,11 @@ def test_neither_task_nor_data_is_an_error() -> None:
     ("options", "message"),
     [
         ({"task": "pointmaze-large"}, "no task 'pointmaze-large'"),
-        ({"horizon": 0}, "horizon: found 0"),
-        ({"stride": 0}, "stride: found 0"),
-        ({"batch_size": 0}, "batch_size: found 0"),
-        ({"validation_fraction": 1.0}, "validation_fraction: found 1.0"),
-        ({"max_validation_segments": 0}, "max_validation_segments: found 0"),
+        ({"horizon": 0}, "horizon: got 0"),
+        ({"stride": 0}, "stride: got 0"),
+        ({"batch_size": 0}, "batch_size: got 0"),
+        ({"validation_fraction": 1.0}, "validation_fraction: got 1.0"),
+        ({"max_validation_segments": 0}, "max_validation_segments: got 0"),
     ],
 )
 def test_settings_out_of_range_are_refused(options: dict[str, Any], message: str) -> None:

@@ -9,8 +9,10 @@ import pandas as pd
 import pytest
 
 from datamodules.behaviours import AntController, load_ladder
-from datamodules.behaviours.publish import MAZES, NOISES, publish_mazes
 from datamodules.behaviours.shipped import SHIPPED
+from datamodules.behaviours.training.evaluation import RunnerScore
+from datamodules.behaviours.training.publish import MAZES, NOISES, Rung, ant_card, publish_mazes, runner_card
+from datamodules.behaviours.training.recipes import get_recipe
 from dds_lightning.envs.antmaze import D4RLAntMazeEnv
 from dds_lightning.errors import UserError
 
@@ -49,6 +51,16 @@ def test_the_shipped_ant_walks_where_it_is_told():
             ant.step(action)
         way = ant.data.qpos[:2] @ [np.cos(heading), np.sin(heading)]
         assert way > 1.5 * 6.0, f"{way:.1f} m in 6 s at heading {heading:.2f}"
+
+
+def test_the_cards_are_what_publishing_writes():
+    assert ant_card(SHIPPED / "ant") == (SHIPPED / "ant" / "README.md").read_text(encoding="utf-8")
+    rungs = [
+        Rung(name, policy, *(RunnerScore(**policy.metadata[key]) for key in ("score", "score_sampled")))
+        for name, policy in load_ladder("hopper").items()
+    ]
+    note = "Training was stopped after 778,272 of the recipe's 1,200,000 steps."
+    assert runner_card(get_recipe("hopper"), rungs, note) == (SHIPPED / "hopper" / "README.md").read_text("utf-8")
 
 
 def test_paths_are_the_repositorys():

@@ -9,6 +9,7 @@ import pytest
 
 from datamodules.trajectories import DataError, Trajectories
 from dds_lightning.errors import UserError
+from dds_lightning.tasks import get_task
 
 Make = Callable[..., dict[str, Any]]
 
@@ -46,7 +47,7 @@ def test_select_keeps_order_and_offsets(three: Trajectories) -> None:
     np.testing.assert_array_equal(part.lengths, [4, 5])
     np.testing.assert_array_equal(part.episode(0)["observations"], three.episode(2)["observations"])
     np.testing.assert_array_equal(part.episode(1)["rewards"], three.episode(0)["rewards"])
-    with pytest.raises(DataError, match="episode 7 was asked for"):
+    with pytest.raises(DataError, match="episode 7 was requested"):
         three.select([7])
     with pytest.raises(DataError, match="no episodes were selected"):
         three.select([])
@@ -86,7 +87,7 @@ def test_split_keeps_usable_episodes_on_both_sides(make_episode: Make) -> None:
         assert len(training) == 2
     with pytest.raises(DataError, match="1 of its episodes have 10 steps"):
         data.select([0, 1]).split(0.1, seed=0, horizon=10)
-    with pytest.raises(DataError, match=r"validation_fraction: found 1\.5"):
+    with pytest.raises(DataError, match=r"validation_fraction: got 1\.5"):
         data.split(1.5, seed=0)
 
 
@@ -143,3 +144,16 @@ def test_damaged_arrays_are_refused(three: Trajectories, tmp_path: Path) -> None
         Trajectories.load(folder)
     with pytest.raises(DataError, match=r"trajectories.json is missing or damaged"):
         Trajectories.load(tmp_path)
+
+
+def test_data_know_the_task_that_they_were_loaded_for(three: Trajectories, tmp_path: Path) -> None:
+    task = get_task("pointmaze-umaze-play")
+    assert three.task is None
+    mark = three.fingerprint()
+    known = three.for_task(task)
+    assert known.task == task
+    assert known.observations is three.observations
+    assert "_fingerprint" in vars(known), "hashing again would read everything again"
+    assert known.fingerprint() == mark
+    assert known.select([2, 0]).task == task
+    assert Trajectories.load(known.save(tmp_path / "set")).task is None

@@ -31,42 +31,42 @@ def _replace(key: str, make: Callable[[Any], Any]) -> Callable[[dict[str, Any]],
 FAULTS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "observation not a number": (
         _put("observations", (3, 1), np.nan),
-        r"observations: found nan at step 3, column 1, expected finite",
+        r"observations: got nan at step 3, column 1, expected finite",
     ),
-    "infinite action": (_put("actions", (2, 0), -np.inf), r"actions: found -inf at step 2, column 0"),
+    "infinite action": (_put("actions", (2, 0), -np.inf), r"actions: got -inf at step 2, column 0"),
     "reward too large for 32 bits": (
         _put("rewards", 4, 1e300),
-        r"rewards: found 1e\+300 at step 4, expected",
+        r"rewards: got 1e\+300 at step 4, expected",
     ),
     "action outside the box": (
         _put("actions", (1, 0), 1.25),
-        r"actions: found 1.25 at step 1, column 0, expected -1 to 1",
+        r"actions: got 1.25 at step 1, column 0, expected -1 to 1",
     ),
     "observations too narrow": (
         _replace("observations", lambda a: a[:, :1]),
-        r"observations: found shape \(7, 1\), expected \(steps, 2\)",
+        r"observations: got shape \(7, 1\), expected \(steps, 2\)",
     ),
     "actions too wide": (
         _replace("actions", lambda a: np.zeros((6, 3))),
-        r"actions: found shape \(6, 3\), expected \(steps, 1\)",
+        r"actions: got shape \(6, 3\), expected \(steps, 1\)",
     ),
-    "flat actions": (_replace("actions", lambda a: a[:, 0]), r"actions: found shape \(6,\), expected"),
+    "flat actions": (_replace("actions", lambda a: a[:, 0]), r"actions: got shape \(6,\), expected"),
     "two-dimensional rewards": (
         _replace("rewards", lambda a: a[:, None]),
-        r"rewards: found shape \(6, 1\), expected \(steps,\)",
+        r"rewards: got shape \(6, 1\), expected \(steps,\)",
     ),
     "T observations": (
         _replace("observations", lambda a: a[:-1]),
-        r"observations: found 6 rows, expected 7 \(T \+ 1\); the observation after the last step is missing",
+        r"observations: got 6 rows, expected 7 \(T \+ 1\); the observation after the last step is missing",
     ),
     "too many observations": (
         _replace("observations", lambda a: np.concatenate([a, a])),
-        r"observations: found 14 rows, expected 7",
+        r"observations: got 14 rows, expected 7",
     ),
-    "an action too few": (_replace("actions", lambda a: a[:-1]), r"actions: found 5 rows, but rewards has 6"),
+    "an action too few": (_replace("actions", lambda a: a[:-1]), r"actions: got 5 rows, but rewards has 6"),
     "a flag too few": (
         _replace("terminations", lambda a: a[1:]),
-        r"terminations: found 5 rows, but rewards has 6",
+        r"terminations: got 5 rows, but rewards has 6",
     ),
     "no end": (
         _replace("truncations", lambda a: a & False),
@@ -74,30 +74,30 @@ FAULTS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     ),
     "a flag inside": (
         _put("truncations", 2, True),
-        r"truncations: found True at step 2, inside an episode of 6 steps",
+        r"truncations: got True at step 2, inside an episode of 6 steps",
     ),
     "flag of 2": (
         _replace("terminations", lambda a: a.astype(int) + 2),
-        r"terminations: found 2, expected 0 or 1",
+        r"terminations: got 2, expected 0 or 1",
     ),
     "numbers as flags": (
         _replace("terminations", lambda a: a.astype(float)),
-        r"terminations: found values of type float64, expected true and false",
+        r"terminations: got values of type float64, expected true and false",
     ),
     "text as rewards": (
         _replace("rewards", lambda a: ["x"] * 6),
-        r"rewards: found values of type <U1, expected real numbers",
+        r"rewards: got values of type <U1, expected real numbers",
     ),
     "ragged observations": (
         _replace("observations", lambda a: [[1, 2], [3]]),
-        r"observations: found values of type object, expected real numbers",
+        r"observations: got values of type object, expected real numbers",
     ),
     "missing key": (
         lambda e: e.pop("rewards"),
-        r"'rewards' is missing; expected observations, actions, rewards, terminations, truncations, found "
+        r"'rewards' is missing; expected observations, actions, rewards, terminations, truncations, got "
         r"observations, actions, terminations, truncations",
     ),
-    "no steps": (lambda e: e.update({k: v[:0] for k, v in e.items()}), r"rewards: found 0 steps"),
+    "no steps": (lambda e: e.update({k: v[:0] for k, v in e.items()}), r"rewards: got 0 steps"),
 }
 
 
@@ -128,7 +128,7 @@ def test_the_box_may_differ_by_dimension(make_episode: Make) -> None:
     data = Trajectories.from_episodes("wide", [episode], action_low=[-2, -1], action_high=[2, 1])
     np.testing.assert_array_equal(data.action_high, [2, 1])
     episode["actions"][:, 1] = 1.5
-    with pytest.raises(DataError, match=r"found 1\.5 at step 0, column 1, expected -1 to 1"):
+    with pytest.raises(DataError, match=r"got 1\.5 at step 0, column 1, expected -1 to 1"):
         Trajectories.from_episodes("wide", [episode], action_low=[-2, -1], action_high=[2, 1])
 
 
@@ -141,5 +141,5 @@ def test_flags_of_0_and_1_are_flags(make_episode: Make) -> None:
 def test_the_first_widths_hold_for_all(make_episode: Make) -> None:
     other = make_episode(5)
     other["observations"] = np.zeros((6, 3))
-    with pytest.raises(DataError, match=r"episode 1, observations: found shape \(6, 3\), expected \(steps, 2\)"):
+    with pytest.raises(DataError, match=r"episode 1, observations: got shape \(6, 3\), expected \(steps, 2\)"):
         Trajectories.from_episodes("mixed", [make_episode(5), other])

@@ -70,5 +70,5 @@ def test_a_horizon_longer_than_every_episode_is_an_error(mixed: Trajectories) ->
 def test_settings_out_of_range_are_refused(mixed: Trajectories, horizon: int, stride: int) -> None:
     with pytest.raises(DataError, match="expected at least 1"):
         mixed.windows(horizon, stride)
-    with pytest.raises(DataError, match="tail: found 'half'"):
+    with pytest.raises(DataError, match="tail: got 'half'"):
         mixed.windows(1, tail="half")  # type: ignore[arg-type]

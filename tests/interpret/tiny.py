@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
 from datamodules.trajectories import Trajectories
 from dds_lightning.agent import DDSAgent
+from dds_lightning.interpret.views import VIEWS
 from dds_lightning.policy import PolicyModule
 from dds_lightning.skill import SkillModule
 from tests.recordings import record
@@ -76,3 +79,9 @@ class Played:
 
     def encode(self, observations, actions, lengths=None):
         return torch.zeros(len(observations), dtype=torch.int64)
+
+
+def hold_shorter(patch, **seconds):
+    """Let pictures of a robot hold their skills for so many seconds, because replays take time."""
+    for name, held in seconds.items():
+        patch.setitem(VIEWS, name, replace(VIEWS[name], held=held))

@@ -55,7 +55,7 @@ def test_ema_moves_each_vector_to_the_mean_of_its_members():
     codebook.set_vectors(torch.arange(2), torch.tensor([[1.0, 0.0], [-1.0, 0.0]]))
     for _ in range(30):
         result = codebook(points)
-        assert result.codebook_loss.item() == 0.0
+        assert result.terms["codebook"].value.item() == 0.0
     torch.testing.assert_close(codebook.vectors, torch.tensor([[2.0, 1.0], [-2.0, -3.0]]), atol=1e-3, rtol=0)
 
 

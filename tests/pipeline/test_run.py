@@ -21,7 +21,6 @@ from dds_lightning.cli import commands, main
 from dds_lightning.errors import UserError
 from dds_lightning.pipeline.settings import RunSettings, Trainings
 from dds_lightning.pipeline.steps import STEPS
-from dds_lightning.rollout.actors import EveryRow
 from dds_lightning.study import report
 from dds_lightning.study.contestants import final_table, way_name
 from dds_lightning.tasks import get_task
@@ -332,21 +331,3 @@ def test_a_run_publishes_the_chosen_way_and_shows_it_first():
 def test_an_unknown_way_of_choosing_is_refused():
     with pytest.raises(UserError, match=r"'guess'.*greedy"):
         way_name("guess")
-
-
-def test_an_actor_of_whole_batches_plays_on_when_others_have_finished():
-    class Doubler:
-        def reset(self, num_envs, seed):
-            self.begun = []
-
-        def act(self, observations, restarted):
-            self.begun.append(restarted.tolist())
-            return 2 * observations[:, :1]
-
-    actor = EveryRow(Doubler())
-    actor.reset(3, seed=0)
-    first = actor.act(np.array([[1.0], [2.0], [3.0]], np.float32), np.array([True] * 3), np.array([0, 1, 2]))
-    assert first.ravel().tolist() == [2, 4, 6]
-    later = actor.act(np.array([[5.0], [7.0]], np.float32), np.array([False, True]), np.array([0, 2]))
-    assert later.ravel().tolist() == [10, 14]
-    assert actor.actor.begun == [[True] * 3, [False, False, True]]

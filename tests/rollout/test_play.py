@@ -14,7 +14,7 @@ import pytest
 
 from dds_lightning.envs.pool import EnvPool, EnvPoolError
 from dds_lightning.errors import UserError
-from dds_lightning.rollout.actors import Contestant, RandomActor
+from dds_lightning.rollout.actors import Acted, Contestant, RandomActor
 from dds_lightning.rollout.play import rollout
 from dds_lightning.rollout.result import RolloutResult
 from dds_lightning.rollout.schedule import episode_seed, slots_needed
@@ -69,10 +69,7 @@ class Coder(Constant):
     """An actor with skills: its code is its row."""
 
     def act(self, observations, restarted, rows):
-        self.codes = np.arange(self.num_envs)
-        self.decided = np.zeros(self.num_envs, bool)
-        self.decided[rows[restarted]] = True
-        return super().act(observations, restarted, rows)
+        return Acted(super().act(observations, restarted, rows), codes=rows, chosen=restarted)
 
 
 @pytest.mark.parametrize("slots", [1, 2, 7, 64])
@@ -247,7 +244,7 @@ def test_a_pool_is_reused_and_a_rollout_in_progress_is_abandoned():
 @pytest.mark.parametrize(
     ("contestants", "message"),
     [
-        ([], "nobody"),
+        ([], "contestants is empty"),
         ([Contestant("a", Constant(0), 0)], "'a': episodes is 0"),
         ([Contestant("a", Constant(0), 2, ["x"])], "1 labels for 2"),
         ([Contestant("a", Constant(0), 1), Contestant("a", Constant(0), 1)], "'a' appears 2 times"),

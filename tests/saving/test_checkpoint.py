@@ -171,7 +171,7 @@ def test_a_checkpoint_that_does_not_fit_is_refused(tmp_path):
     wide = lightning_ckpt(tmp_path / "wide.ckpt", small_policy(), hidden_dims=[16])
     with pytest.raises(UserError, match=r"wide\.ckpt does not fit PolicyModule: .* is \(.*\), expected \("):
         load_module(PolicyModule, wide, "policy")
-    with pytest.raises(UserError, match=r"wide\.ckpt holds no SkillModule of this version"):
+    with pytest.raises(UserError, match=r"wide\.ckpt does not hold a SkillModule of this version"):
         SkillModule.load(wide)
     single = lightning_ckpt(tmp_path / "single.ckpt", small_policy(), num_skills=1)
     with pytest.raises(UserError, match=r"single\.ckpt: model\.num_skills is 1"):
@@ -264,7 +264,9 @@ def test_consistent_but_wrong_directories_are_refused(published):
     change("config.yaml", "!!python/object/apply:os.mkdir [was_here]", "config.yaml cannot be read")
     change("config.yaml", yaml.safe_dump({"format_version": 1}), "describes no 'policy'")
     settings = {**config["policy"], "wings": 2}
-    change("config.yaml", yaml.safe_dump({**config, "policy": settings}), "no PolicyModule of this version.*wings")
+    change(
+        "config.yaml", yaml.safe_dump({**config, "policy": settings}), "not hold a PolicyModule of this version.*wings"
+    )
     settings = {**config["policy"], "hidden_dims": [9]}
     change("config.yaml", yaml.safe_dump({**config, "policy": settings}), r"policy\) does not fit .* expected")
     change("metrics.json", "{", "metrics.json cannot be read")
@@ -277,13 +279,13 @@ def test_consistent_but_wrong_directories_are_refused(published):
 def test_names_that_lead_elsewhere_are_refused(published):
     with (published / "SHA256SUMS").open("a") as file:
         file.write(f"{'0' * 64}  ../../etc/passwd\n")
-    with pytest.raises(UserError, match="no line of it"):
+    with pytest.raises(UserError, match="is not a valid line"):
         load_published(published)
 
 
 def test_a_wrong_directory_says_what_is_there(tmp_path):
     (tmp_path / "run").mkdir()
-    with pytest.raises(UserError, match=r"run is no published checkpoint: it lacks model.* it holds nothing"):
+    with pytest.raises(UserError, match=r"run is not a published checkpoint: it lacks model.* it holds nothing"):
         load_published(tmp_path / "run")
     with pytest.raises(UserError, match=r"no published checkpoint .*rum; .* holds run"):
         load_published(tmp_path / "rum")
@@ -399,5 +401,5 @@ def test_a_trainer_saves_and_resumes_through_it(tmp_path):
 def test_the_agent_says_which_file_is_missing(tmp_path):
     DDSAgent(small_skill(), small_policy()).save(tmp_path / "agent")
     (tmp_path / "agent" / "config.yaml").unlink()
-    with pytest.raises(UserError, match=r"agent is no published checkpoint: it lacks config\.yaml"):
+    with pytest.raises(UserError, match=r"agent is not a published checkpoint: it lacks config\.yaml"):
         DDSAgent.load(tmp_path / "agent")

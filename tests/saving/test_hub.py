@@ -75,7 +75,7 @@ def test_a_changed_file_is_refused_before_sending_and_after_fetching(hub, tmp_pa
 
 @pytest.mark.parametrize("place", ["hf:", "hf:maze", "hf:a/b/c", "hf:../x", "hf:a/b@", "https://a/b"])
 def test_other_places_are_refused(hub, place):
-    with pytest.raises(UserError, match="is no place on the hub, expected hf:OWNER/NAME"):
+    with pytest.raises(UserError, match="is not a Hub address, expected hf:OWNER/NAME"):
         pull(place)
 
 

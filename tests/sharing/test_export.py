@@ -134,7 +134,7 @@ def test_damaged_and_missing_files_are_refused(exported, tmp_path):
     _, path = exported
     damaged = tmp_path / path.name
     damaged.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with pytest.raises(UserError, match="is no exported agent, or damaged"):
+    with pytest.raises(UserError, match="is not an exported agent, or damaged"):
         load_exported(damaged)
     with pytest.raises(UserError, match=r"there is no file .*`dds export`"):
         load_exported(tmp_path / "nothing.onnx")

@@ -50,8 +50,8 @@ def test_changed_weights_are_noticed_by_their_answers_even_under_new_hashes(copy
     ("golden", "message"),
     [
         ({"actions": [[0.0, 0.0]]}, r"golden, actions: found shape \(1, 2\), expected \(8, 2\)"),
-        ({}, "golden, actions: found no table of numbers"),
-        ({"actions": "much"}, "golden, actions: found no table of numbers"),
+        ({}, "golden, actions: expected a table of numbers"),
+        ({"actions": "much"}, "golden, actions: expected a table of numbers"),
     ],
 )
 def test_golden_answers_that_are_none_are_refused(copy, golden, message):

@@ -47,7 +47,7 @@ def test_the_card_names_task_score_seed_data_settings_and_command():
         "`dds run pointmaze-large-diverse --seed=3`",
         "| random skills | 2 | 0.0 |",
         "a skill every 10 steps",
-        "(the skills can be used again). The\ndata were made by a scripted controller of this project; scores are not",
+        "(the skills can be used again). The\ndata come from this project's controllers: scores are not comparable",
     ):
         assert part in text
     assert max(map(len, text.splitlines())) < 200
@@ -74,7 +74,7 @@ def test_the_last_section_is_about_this_task_and_these_data(name, source, known,
     limits = " ".join(text.partition("## What it cannot do")[2].split())
     assert known in limits
     assert whose in limits
-    assert "scripted controller" not in text
+    assert "this project" not in text or "collected" in text
     paper = get_task(name).paper_score
     assert ("The paper reports" in text) == (paper is not None)
     if name.startswith("hopper"):

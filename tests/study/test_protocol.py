@@ -3,11 +3,15 @@
 import numpy as np
 import pytest
 import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
 
 from dds_lightning.agent import DDSAgent
+from dds_lightning.callbacks.best import BestCheckpoint
+from dds_lightning.callbacks.rollouts import RolloutEvaluation
+from dds_lightning.errors import UserError
 from dds_lightning.policy import PolicyModule
 from dds_lightning.skill import SkillModule
-from dds_lightning.study.contestants import best_ways, best_words
+from dds_lightning.study.contestants import best_label, best_ways
 from dds_lightning.study.protocol import best_facts, full_name, heading, paper_line, protocol, start_value
 from dds_lightning.tasks import get_task
 
@@ -60,18 +64,26 @@ def test_the_papers_score_stands_with_whose_data_it_is_from():
     assert paper_line(get_task("kitchen-complete")) is None
 
 
-def test_how_the_best_was_chosen_is_read_from_its_files(tmp_path):
+@pytest.mark.parametrize(
+    "key", [BestCheckpoint("rollout/score").state_key, "BestCheckpoint{'monitor': 'rollout/score'}"]
+)
+def test_how_the_best_was_chosen_is_read_from_its_files(tmp_path, key):
     history = [{"step": 5.0, "rollout/score": 10.0}, {"step": 10.0, "rollout/score": 30.0}, {"step": 15.0, "x": 1.0}]
-    kept = {"BestCheckpoint{'monitor': 'rollout/score'}": {"monitor": "rollout/score", "best_model_score": 30.0}}
+    other = {ModelCheckpoint(monitor="x").state_key: {"monitor": "x", "best_model_score": 1.0}}
+    kept = other | {key: {"monitor": "rollout/score", "best_model_score": 30.0}}
+    played = {RolloutEvaluation("pointmaze-umaze-diverse").state_key: {"history": history}}
     best = {"state_dict": {}, "global_step": 10, "callbacks": kept}
-    last = {"state_dict": {}, "global_step": 20, "callbacks": {**kept, "RolloutEvaluation": {"history": history}}}
+    last = {"state_dict": {}, "global_step": 20, "callbacks": {**kept, **played}}
     for name, checkpoint in (("best", best), ("last", last)):
         torch.save(checkpoint, tmp_path / f"{name}.ckpt")
     facts = best_facts(tmp_path / "last.ckpt", tmp_path / "best.ckpt")
+    torch.save({**last, "callbacks": played}, tmp_path / "other.ckpt")
+    with pytest.raises(UserError, match="was not kept as a best checkpoint"):
+        best_facts(tmp_path / "last.ckpt", tmp_path / "other.ckpt")
     assert facts == {"monitor": "rollout/score", "value": 30.0, "step": 10, "evaluations": 2}
-    assert best_words(facts) == "best of 2 evaluations while training, step 10: optimistic"
+    assert best_label(facts) == "best of 2 evaluations while training, step 10: optimistic"
     assert (
-        best_words({**facts, "monitor": "val/q_loss", "evaluations": None}) == "best val/q_loss while training, step 10"
+        best_label({**facts, "monitor": "val/q_loss", "evaluations": None}) == "best val/q_loss while training, step 10"
     )
     ways = best_ways(agent(get_task("hopper-medium")), 3, facts)
     assert [way.name.partition(" (")[0] for way in ways] == ["AWR policy, sampled", "AWR policy, greedy"]

@@ -185,7 +185,7 @@ def test_what_a_killed_launch_logged_too_much_is_left_out(run, tmp_path):
 def test_a_task_without_a_maze_has_tables_and_no_maze_figures(run, tmp_path, monkeypatch):
     shutil.copytree(run, tmp_path / "run", ignore=shutil.ignore_patterns("report"))
     plain_task = dataclasses.replace(TASK, maze_map=None, start_cell=None, goal_cell=None)
-    monkeypatch.setattr(findings, "get_task", lambda name: plain_task)
+    monkeypatch.setattr(findings, "known_task", lambda name: plain_task)
     made = write_report(tmp_path / "run")
     assert made.keys() & {"trajectories", "clip", "values", "failed_ends"} == set()
     assert made["failures"][0]["row"] is None

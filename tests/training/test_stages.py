@@ -78,6 +78,8 @@ def test_a_new_stage_is_published_and_starts_another_training(dds, data, tmp_pat
     module = Forward.load(checkpoint)
     place = publish(tmp_path / "published", {module.STAGE: module}, {"task": TASK})
     again = load_published(place).module(Forward, "forward")
+    verified = dds("checkpoints", "verify", place)
+    assert f"is sound: task {TASK}, 20 parameters, a forward model" in " ".join(verified.out.split()), verified.err
     assert all(torch.equal(value, again.state_dict()[name]) for name, value in module.state_dict().items())
     tuned = fit(dds, data, tmp_path / "second", 1, f"--model.init_from={place}", "--model.lr=1e-9")
     change = weights(tuned)["net.weight"] - module.net.weight

@@ -1,16 +1,23 @@
-"""Where the Ant learns to walk: many bodies on one endless floor, each told a heading that changes."""
+"""Where the Ant learns to walk: many bodies on an endless floor, each commanded a heading that changes.
+
+Runners train in Gymnasium's environments, stepped by stable-baselines3's `DummyVecEnv`. The Ant has a vectorised
+environment of its own because what its policy observes (`ant.see`: rotation, symmetry, heading) is a few dozen small
+array operations. For one body at a time they cost as much as the physics; for all bodies at once they are cheap.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
 
 from datamodules.behaviours.ant import FEATURES, PHYSICS, motor_actions, rotation_matrices, see
-from datamodules.behaviours.training.worlds import World
 from dds_lightning.errors import UserError
 
 Array = NDArray[np.float64]
@@ -21,23 +28,23 @@ class WalkRules:
     """What is rewarded and what disturbs; steps are the environment's.
 
     The reward of a step is `speed along the heading - sideways * |speed across it| + alive - effort * |action|^2
-    - level * (1 - cosine of the tilt)`, speeds in metres a second. Disturbances are there because mazes have walls
-    and collectors add noise.
+    - level * (1 - cosine of the tilt)`, with speeds in metres per second. The disturbances are there because mazes
+    have walls and collectors add noise.
 
     Attributes:
-        sideways: See above.
-        alive: See above.
-        effort: See above.
-        level: See above.
+        sideways: Weight of the speed across the heading.
+        alive: Reward of every step.
+        effort: Weight of the squared action.
+        level: Weight of the torso's tilt.
         heading_steps: Fewest and most steps for which a heading holds.
-        drift: Deviation in radians of a heading's random walk in between, as towards a waypoint passed nearby.
-        action_noise: Each episode's deviation of Gaussian noise on actions is drawn from 0 to this.
-        kick_probability: Chance that a step ends with a push.
-        kick: Deviation of a push, m/s and rad/s.
-        tilted_share: Share of episodes that start tilted, joints anywhere, in motion.
+        drift: Standard deviation in radians of the heading's random walk in between, as when a waypoint passes nearby.
+        action_noise: Upper end of the range from which each episode draws its standard deviation of action noise.
+        kick_probability: Probability that a step ends with a push.
+        kick: Standard deviation of a push, in m/s and rad/s.
+        tilted_share: Share of episodes that start tilted and in motion, with joints anywhere in their range.
         tilt: Largest tilt of these in radians.
         fallen: An episode ends when the cosine of the tilt is below this.
-        episode_steps: Longest episode.
+        episode_steps: Length of the longest episode.
     """
 
     sideways: float = 0.3
@@ -59,11 +66,11 @@ RULES = {
     "d4rl": WalkRules(),
     "robotics": WalkRules(heading_steps=(20, 160), drift=0.02, kick_probability=0.005),
 }
-"""By physics; a step of robotics' is half as long."""
+"""Rules by physics; a step of "robotics" is half as long."""
 
 
 def calm(physics: str) -> WalkRules:
-    """The rules without any disturbance, for evaluation; a fall does not end an episode."""
+    """The rules of a physics without any disturbance, for evaluation; a fall does not end an episode."""
     return replace(
         RULES[physics],
         drift=0.0,
@@ -82,10 +89,13 @@ def ant_simulator(physics: str) -> tuple[mujoco.MjModel, float]:
         physics: "d4rl" or "robotics".
 
     Returns:
-        The model, and what an action of 1 is in the simulator's controls. A step is 5 of the model's.
+        The model, and the simulator's control for an action of 1. An environment step is 5 of the model's.
+
+    Raises:
+        UserError: There is no such physics.
     """
     if physics not in PHYSICS:
-        raise UserError(f"physics: found '{physics}', expected one of {', '.join(PHYSICS)}")
+        raise UserError(f"physics: got '{physics}', expected one of {', '.join(PHYSICS)}")
     if physics == "d4rl":
         from dds_lightning.envs.antmaze import TORQUE, D4RLAntMazeEnv
 
@@ -95,26 +105,33 @@ def ant_simulator(physics: str) -> tuple[mujoco.MjModel, float]:
     return build_env("Ant-v4").unwrapped.model, 1.0  # type: ignore[attr-defined]
 
 
-class AntWorld(World):
-    """`count` Ants, one after the other in one process, with observations and rewards computed for all at once.
+class AntWorld(VecEnv):
+    """`count` Ants in one process: simulated one after the other, observed and rewarded all at once.
 
-    Observations are those of `ant.see`, actions are in the policy's numbering of legs. At an episode's end the
-    info holds its length, mean speed along the heading and whether it fell.
+    Observations are those of `ant.see`; actions follow the policy's numbering of legs. At the end of an episode
+    `info["walk"]` holds its length, its mean speed along the heading and whether the Ant fell.
 
     Args:
         physics: "d4rl" or "robotics".
         count: Number of Ants.
-        rules: Rewards and disturbances; by default the physics' own of `RULES`.
-        seed: Of everything that is drawn.
+        rules: Rewards and disturbances; by default the entry of `RULES` for the physics.
+        seed: Seed of all random numbers.
     """
 
     frame_skip = 5
 
     def __init__(self, physics: str, count: int, rules: WalkRules | None = None, seed: int = 0) -> None:
-        model, self.force = ant_simulator(physics)
-        super().__init__(model, count, FEATURES, seed)
+        self.render_mode = None
+        self.model, self.force = ant_simulator(physics)
+        box = spaces.Box(-1.0, 1.0, (self.model.nu,), np.float32)
+        super().__init__(count, spaces.Box(-np.inf, np.inf, (FEATURES,), np.float32), box)
+        self.data = [mujoco.MjData(self.model) for _ in range(count)]
+        self.rng = np.random.default_rng(seed)
+        self.qpos, self.qvel = np.zeros((count, self.model.nq)), np.zeros((count, self.model.nv))
+        self.steps = np.zeros(count, dtype=np.int64)
+        self.actions = np.zeros((count, self.model.nu))
         self.rules = rules or RULES[physics]
-        self.seconds = model.opt.timestep * self.frame_skip
+        self.seconds = self.model.opt.timestep * self.frame_skip
         self.headings = np.zeros(count)
         self.until = np.zeros(count, dtype=np.int64)
         self.noise = np.zeros(count)
@@ -129,7 +146,7 @@ class AntWorld(World):
         """Start all episodes."""
         for i in range(self.num_envs):
             self._start(i)
-        return self._see()
+        return self._observe()
 
     def _start(self, i: int) -> None:
         rules, rng, data = self.rules, self.rng, self.data[i]
@@ -147,22 +164,29 @@ class AntWorld(World):
         mujoco.mj_forward(self.model, data)
         self.steps[i], self.speed_sum[i] = 0, 0.0
         self.noise[i] = rng.uniform(0.0, rules.action_noise)
-        self._tell(i)
-        self.record(i)
+        self._command_heading(i)
+        self._read_state(i)
 
-    def _tell(self, i: int) -> None:
-        """Command a new heading."""
+    def _read_state(self, i: int) -> None:
+        self.qpos[i], self.qvel[i] = self.data[i].qpos, self.data[i].qvel
+
+    def _command_heading(self, i: int) -> None:
+        """Draw a new heading and the step at which it ends."""
         self.headings[i] = self.rng.uniform(-np.pi, np.pi)
         self.until[i] = self.steps[i] + self.rng.integers(*self.rules.heading_steps, endpoint=True)
 
-    def _see(self) -> NDArray[np.float32]:
+    def _observe(self) -> NDArray[np.float32]:
         seen, self.turns = see(np.concatenate([self.qpos, self.qvel], axis=1), self.headings)
         return seen.astype(np.float32)
 
     # ------------------------------------------------------------------ steps
 
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Keep the actions (count, 8), clipped to [-1, 1], for `step_wait`."""
+        self.actions = np.clip(actions, -1.0, 1.0).astype(np.float64)
+
     def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        """Move everybody by one step; whoever is done starts again."""
+        """Move every Ant by one step and restart those whose episode is over."""
         rules, rng = self.rules, self.rng
         noise = self.noise[:, None] * rng.standard_normal((self.num_envs, 8))
         controls = motor_actions(np.clip(self.actions + noise, -1.0, 1.0), self.turns) * self.force
@@ -173,7 +197,7 @@ class AntWorld(World):
             mujoco.mj_step(self.model, data, nstep=self.frame_skip)
             if kicked[i]:
                 data.qvel[:6] += rules.kick * rng.standard_normal(6)
-            self.record(i)
+            self._read_state(i)
         self.steps += 1
         velocity = (self.qpos[:, :2] - before) / self.seconds
         cosine, sine = np.cos(self.headings), np.sin(self.headings)
@@ -188,8 +212,8 @@ class AntWorld(World):
         late = self.steps >= rules.episode_steps
         self.headings += rules.drift * rng.standard_normal(self.num_envs)
         for i in np.flatnonzero(self.steps >= self.until).tolist():
-            self._tell(i)
-        seen = self._see()
+            self._command_heading(i)
+        seen = self._observe()
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         done = fell | late
         for i in np.flatnonzero(done).tolist():
@@ -201,8 +225,31 @@ class AntWorld(World):
             }
             self._start(i)
         if done.any():
-            seen = self._see()
+            seen = self._observe()
         return seen, rewards.astype(np.float32), done, infos
+
+    # ------------------------------------------------------------------ the rest of stable-baselines3's interface
+
+    def close(self) -> None:
+        """Do nothing: there is nothing to release."""
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """The attribute of this object, which all Ants share, once per Ant."""
+        return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
+
+    def _unsupported(self, *args: Any, **kwargs: Any) -> Any:
+        raise NotImplementedError("the Ants of an AntWorld have no attributes or methods of their own")
+
+    set_attr = env_method = _unsupported
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        """False: no Ant has a wrapper of its own."""
+        return [False] * len(list(self._get_indices(indices)))
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Seed all random numbers."""
+        self.rng = np.random.default_rng(seed)
+        return [seed] * self.num_envs
 
 
 def _orientation(yaw: float, tilt: float, axis: float) -> Array:

@@ -1,4 +1,4 @@
-"""Scores of behaviour policies: returns of runners, speeds and falls of the Ant."""
+"""Scores of behaviour policies: returns of the runners, speed and falls of the Ant."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dds_lightning.envs.build import build_env
 from dds_lightning.tasks import get_task
 
 UPRIGHT, ON_ITS_BACK = 0.5, 0.0
-"""Cosines of the tilt: a body that was above the first and comes below the second has fallen."""
+"""Cosines of the tilt: a body has fallen when it was above the first and drops below the second."""
 
 
 @dataclass(frozen=True)
@@ -25,10 +25,10 @@ class RunnerScore:
     Attributes:
         score: Mean D4RL-normalised score.
         mean_return: Mean return.
-        std_return: Deviation of the returns.
-        mean_steps: Mean length.
-        episodes: How many.
-        sampled: Whether actions were sampled as in training; else they are the policy's means.
+        std_return: Standard deviation of the returns.
+        mean_steps: Mean length of the episodes.
+        episodes: Number of episodes.
+        sampled: Whether actions were sampled as in training; otherwise they are the policy's means.
     """
 
     score: float
@@ -49,11 +49,14 @@ def score_runner(
     """Play whole episodes side by side.
 
     Args:
-        policy: Who acts.
+        policy: The policy that acts.
         behaviour: "hopper", "walker2d" or "halfcheetah".
-        episodes: How many; episode i is reset with `seed + i`.
-        seed: Of episodes and sampled actions.
+        episodes: Number of episodes; episode i is reset with `seed + i`.
+        seed: Seed of the episodes and of sampled actions.
         sampled: Sample actions as in training.
+
+    Returns:
+        The score over all episodes.
     """
     task = get_task(f"{behaviour}-medium")
     environments = [build_env(task.env_id) for _ in range(episodes)]
@@ -82,14 +85,14 @@ def score_runner(
 
 @dataclass(frozen=True)
 class WalkScore:
-    """How an Ant follows headings.
+    """How well an Ant follows headings.
 
     Attributes:
-        action_noise: Deviation of Gaussian noise on its actions.
-        speed: Mean speed along the heading in m/s, time on its back included.
+        action_noise: Standard deviation of Gaussian noise on its actions.
+        speed: Mean speed along the heading in m/s, including time on its back.
         upright_speed: The same over the steps of Ants that have not fallen yet.
-        falls_per_1000: Falls in 1,000 steps of bodies that stand.
-        on_its_back: Share of the Ants that lie at the end.
+        falls_per_1000: Falls per 1,000 steps of standing bodies.
+        on_its_back: Share of the Ants that lie on their backs at the end.
         steps: Environment steps behind the numbers.
     """
 
@@ -118,13 +121,16 @@ def score_walker(
     """Let Ants follow changing headings for one long episode each; a fall does not end it.
 
     Args:
-        act: Features (B, 28) of `ant.see` to actions (B, 8), `MLPPolicy.act` for example.
+        act: Maps features (B, 28) of `ant.see` to actions (B, 8); `MLPPolicy.act`, for example.
         physics: "d4rl" or "robotics".
-        action_noise: Deviation of Gaussian noise on the actions.
-        ants: Episodes.
+        action_noise: Standard deviation of Gaussian noise on the actions.
+        ants: Number of episodes.
         steps: Steps of an episode.
-        seed: Of starts, headings and noise.
+        seed: Seed of starts, headings and noise.
         heading_steps: Fewest and most steps for which a heading holds; by default as in training.
+
+    Returns:
+        The score over all Ants and steps.
     """
     from datamodules.behaviours.training.ant_world import AntWorld, calm
 
@@ -163,23 +169,23 @@ def score_navigator(noises: tuple[float, ...], *, episodes: int = 100, seed: int
     """Let the shipped Ant controller walk from the start to the evaluation's goal, in each of D4RL's mazes.
 
     Args:
-        noises: Deviations of Gaussian noise on the actions.
-        episodes: Of each maze and noise.
-        seed: Of goals, starts and noise.
+        noises: Standard deviations of Gaussian noise on the actions.
+        episodes: Number of episodes for each maze and noise.
+        seed: Seed of goals, starts and noise.
 
     Returns:
-        A row a maze and noise: `maze`, `action_noise`, `episodes`, `reached`, `median_steps` (of those that reached
-        the goal), `cap` (steps after which an episode is over).
+        One row per maze and noise: `maze`, `action_noise`, `episodes`, `reached`, `median_steps` (of the episodes that
+        reached the goal), `cap` (steps after which an episode is over).
     """
     from datamodules.collect.antmaze import AntMazeRecipe, AntNavigator
-    from dds_lightning.rollout.actors import Contestant, EveryRow
+    from dds_lightning.rollout.actors import Contestant
     from dds_lightning.rollout.play import rollout
 
     rows = []
     for maze in ("umaze", "medium", "large"):
         task = get_task("antmaze-umaze" if maze == "umaze" else f"antmaze-{maze}-diverse")
         players = [
-            Contestant(f"{noise:g}", EveryRow(AntNavigator(task, AntMazeRecipe(action_noise=noise))), episodes)
+            Contestant(f"{noise:g}", AntNavigator(task, AntMazeRecipe(action_noise=noise)), episodes)
             for noise in noises
         ]
         played = rollout(task, players, seed=seed).episodes

@@ -1,33 +1,37 @@
-"""stable-baselines3 made ready for a recipe: worlds, algorithm, export to NumPy, and a state to go on from."""
+"""stable-baselines3's PPO set up for a recipe: environments, algorithm, export to NumPy, and a state to resume from."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
 
 from datamodules.behaviours.policy import OBSERVATION_CLIP, MLPPolicy
 from datamodules.behaviours.training.ant_world import AntWorld
-from datamodules.behaviours.training.fast_ppo import FastPPO
 from datamodules.behaviours.training.recipes import Recipe
-from datamodules.behaviours.training.worlds import RunnerWorld, World
+from dds_lightning.envs.build import build_env
+from dds_lightning.errors import UserError
 from dds_lightning.saving.checkpoint import load_ckpt
 from dds_lightning.saving.files import written_whole
 
 
-def build_world(recipe: Recipe, seed: int) -> World:
-    """The recipe's environments, not normalised."""
+def build_world(recipe: Recipe, seed: int) -> VecEnv:
+    """The recipe's environments, side by side, before normalisation."""
     if recipe.world.startswith("ant:"):
         return AntWorld(recipe.world.removeprefix("ant:"), recipe.environments, seed=seed)
-    return RunnerWorld(recipe.world, recipe.environments, seed)
+    world = DummyVecEnv([partial(build_env, recipe.world)] * recipe.environments)
+    world.seed(seed)
+    return world
 
 
-def build_learner(recipe: Recipe, seed: int) -> FastPPO:
-    """A fresh learner, its environments normalised by running statistics."""
+def build_learner(recipe: Recipe, seed: int) -> PPO:
+    """A new learner; observations and rewards are normalised by running statistics."""
     world = VecNormalize(
         VecMonitor(build_world(recipe, seed)), gamma=recipe.settings["gamma"], clip_obs=OBSERVATION_CLIP
     )
@@ -36,11 +40,11 @@ def build_learner(recipe: Recipe, seed: int) -> FastPPO:
         "activation_fn": torch.nn.Tanh,
         **recipe.policy_settings,
     }
-    return FastPPO("MlpPolicy", world, policy_kwargs=policy_settings, device="cpu", seed=seed, **recipe.settings)
+    return PPO("MlpPolicy", world, policy_kwargs=policy_settings, device="cpu", seed=seed, **recipe.settings)
 
 
-def export_policy(learner: FastPPO, metadata: Mapping[str, Any]) -> MLPPolicy:
-    """The actor as it stands, with the observation statistics of now."""
+def export_policy(learner: PPO, metadata: Mapping[str, Any]) -> MLPPolicy:
+    """The learner's current actor together with its current observation statistics."""
     policy: Any = learner.policy
     world: Any = learner.get_vec_normalize_env()
     layers = [m for m in policy.mlp_extractor.policy_net if isinstance(m, torch.nn.Linear)] + [policy.action_net]
@@ -56,13 +60,12 @@ def export_policy(learner: FastPPO, metadata: Mapping[str, Any]) -> MLPPolicy:
     )
 
 
-def save_state(learner: FastPPO, path: Path, facts: Mapping[str, Any]) -> None:
-    """Write what a training needs to go on: networks, Adam's means, statistics, steps. Episodes start again."""
+def save_state(learner: PPO, path: Path, facts: Mapping[str, Any]) -> None:
+    """Write what a training needs to resume: networks, optimiser, statistics, steps. Episodes start again."""
     world: Any = learner.get_vec_normalize_env()
     state = {
         "state_dict": learner.policy.state_dict(),
-        "moments": [torch.from_numpy(moment) for moment in learner.moments],
-        "adam_steps": learner.adam_steps,
+        "optimizer": learner.policy.optimizer.state_dict(),
         "steps": learner.num_timesteps,
         "facts": dict(facts),
     }
@@ -73,17 +76,21 @@ def save_state(learner: FastPPO, path: Path, facts: Mapping[str, Any]) -> None:
         torch.save(state, part)
 
 
-def load_state(learner: FastPPO, path: Path) -> dict[str, Any]:
-    """Go on from what `save_state` wrote; returns its facts.
+def load_state(learner: PPO, path: Path) -> dict[str, Any]:
+    """Resume from what `save_state` wrote.
+
+    Returns:
+        The facts that were saved with the state.
 
     Raises:
-        UserError: The file is missing or damaged.
+        UserError: The file is missing or damaged, or an earlier version wrote it.
     """
     state = load_ckpt(path)
+    if "optimizer" not in state:
+        raise UserError(f"resume: {path} has no optimiser state (an earlier version wrote it); train again from step 0")
     learner.policy.load_state_dict(state["state_dict"])
-    for moment, saved in zip(learner.moments, state["moments"], strict=True):
-        moment[:] = saved.numpy()
-    learner.adam_steps, learner.num_timesteps = state["adam_steps"], state["steps"]
+    learner.policy.optimizer.load_state_dict(state["optimizer"])
+    learner.num_timesteps = state["steps"]
     world: Any = learner.get_vec_normalize_env()
     for name in ("obs_rms", "ret_rms"):
         rms, saved = getattr(world, name), state[name]

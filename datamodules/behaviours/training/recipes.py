@@ -1,4 +1,9 @@
-"""How each behaviour is trained: every number of it, in one place."""
+"""How each behaviour is trained: all numbers in one place.
+
+The shipped policies were trained with these numbers by an earlier implementation of the same algorithm, so training
+again follows the same rules but does not give the same bits. A runner takes 0.5 ms per step on one core, about four
+times as long as then (the halfcheetah 50 minutes in all); the Ant takes 0.16 ms in place of 0.12 ms.
+"""
 
 from __future__ import annotations
 
@@ -10,25 +15,25 @@ from dds_lightning.errors import UserError
 
 
 def falling(start: float, end: float) -> Callable[[float], float]:
-    """A learning rate that goes from `start` to `end` in a straight line."""
+    """A learning rate that falls linearly from `start` to `end`."""
     return lambda remaining: end + (start - end) * remaining
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """One training.
+    """One training of one behaviour.
 
     Attributes:
-        name: What a user types.
+        name: Name on the command line.
         world: Gymnasium's name of the environment, or "ant:PHYSICS".
         steps: Environment steps of the whole training.
-        environments: How many of them side by side.
+        environments: Number of environments side by side.
         hidden: Widths of the actor's hidden layers.
-        settings: More arguments of the algorithm.
-        policy_settings: More arguments of its policy.
-        coarse_steps: First steps, simulated by Euler's method in place of Runge-Kutta's: a quarter of the cost, nearly
-            the same motion. The rest is learnt in the true physics.
-        rungs: Snapshots that are kept along the way.
+        settings: Further arguments of PPO.
+        policy_settings: Further arguments of its policy.
+        coarse_steps: Number of steps at the beginning that are simulated with Euler's method instead of Runge-Kutta:
+            a quarter of the cost, nearly the same motion. The rest is learnt in the true physics.
+        rungs: Number of snapshots on the way.
     """
 
     name: str
@@ -94,18 +99,18 @@ RECIPES = {
         _runner("hopper", "Hopper-v4", 1_200_000, 900_000),
         _runner("walker2d", "Walker2d-v4", 3_000_000, 2_600_000),
         # Without a bonus on entropy the cheetah stops exploring early, in a gait that ends at 65 points. It learns so
-        # fast at first that snapshots must be close for a ladder to have a medium rung.
+        # fast at first that snapshots must be close together for a ladder to have a medium rung.
         _runner("halfcheetah", "HalfCheetah-v4", 6_000_000, rungs=120, ent_coef=0.003),
     )
 }
 
 
 def get_recipe(name: str) -> Recipe:
-    """The recipe of that name.
+    """The recipe with this name.
 
     Raises:
-        UserError: There is none.
+        UserError: There is no such recipe.
     """
     if name not in RECIPES:
-        raise UserError(f"behaviour: found '{name}', expected one of {', '.join(RECIPES)}")
+        raise UserError(f"behaviour: got '{name}', expected one of {', '.join(RECIPES)}")
     return RECIPES[name]

@@ -24,9 +24,11 @@ from dds_lightning.interpret.draw import charts
 from dds_lightning.interpret.measure import statistics
 from dds_lightning.interpret.measure.comparison import compare_recovery
 from dds_lightning.interpret.measure.recovery import Recovery, RoundTrip, code_recovery, round_trip
-from dds_lightning.interpret.measure.replay import draw_states, simulator
+from dds_lightning.interpret.measure.replay import play_skills, simulator
+from dds_lightning.interpret.measure.states import draw_states
 from dds_lightning.rollout.result import RolloutResult
 from dds_lightning.tasks import Task
+from dds_lightning.tasks.bodies import has_state
 
 if TYPE_CHECKING:
     from dds_lightning.agent import DDSAgent
@@ -132,12 +134,15 @@ def make_atlas(
     distances = statistics.code_distances(skill)
     table["nearest"] = statistics.nearest_codes(distances)
     table["near"] = distances[np.arange(len(distances)), table["nearest"]]
-    drawn = draw_states(task, trajectories, states, seed)
+    if not has_state(task):
+        tell("playing skills at random: the data do not hold the simulator's state")
+    stage = trajectories if has_state(task) else play_skills(task, skill, seed=seed)
+    drawn = draw_states(task, stage, states, seed)
     spread = statistics.decoder_diversity(skill, drawn.observations, noise_scale=agent.noise_scale, seed=seed)
     table[["spread", "apart"]] = spread[["spread", "apart"]]
     with simulator(task) as env:
         tell("telling codes from behaviour")
-        trip = round_trip(task, skill, trajectories, states, agent.noise_scale, seed, env)
+        trip = round_trip(task, skill, stage, states, agent.noise_scale, seed, env)
         recovery, _ = code_recovery(task, skill, drawn, used, agent.noise_scale, seed, env)
         for name, codes, shares in (
             ("again", trip.codes, trip.by_code),
@@ -159,7 +164,7 @@ def make_atlas(
     if others:
         rows = [(DISCRETE, skill), *others]
         comparison = compare_recovery(
-            task, trajectories, rows, skill.num_skills, states, seed, lambda name: tell(f"comparing: {name}")
+            task, stage, rows, skill.num_skills, states, seed, lambda name: tell(f"comparing: {name}")
         )
         studio.keep(
             "comparison",

@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 from dds_lightning.interpret.draw import charts, clip, maze, stitching, strobe, values
 from dds_lightning.interpret.draw.png import png_bytes
 from dds_lightning.interpret.draw.rendering import plot_rendered, render_frames
-from dds_lightning.interpret.measure.body import body_frames, has_limbs
-from dds_lightning.interpret.measure.replay import BodyStates, Replays, junctions, replay_codes, rest_states
+from dds_lightning.interpret.measure.body import body_frames
+from dds_lightning.interpret.measure.replay import Replays, replay_codes
+from dds_lightning.interpret.measure.states import BodyStates, junctions, rest_states
+from dds_lightning.interpret.views import view_of
 from dds_lightning.rollout.result import RolloutResult
 from dds_lightning.tasks import Task
 
@@ -26,10 +28,6 @@ if TYPE_CHECKING:
     from dds_lightning.interpret.measure.statistics import CodedSegments
 
 DPI = 130
-HELD = {"pointmaze": 1.0, "antmaze": 6.0, "locomotion": 1.0, "kitchen": 2.4}
-"""Seconds that a skill is held to see what it does; whole skills are played."""
-BODIES = {"antmaze": 4, "locomotion": 8, "kitchen": 6}
-"""Bodies between the first and the last of a stroboscopic picture."""
 STROBES = 4
 """Skills in a stroboscopic picture."""
 
@@ -97,7 +95,7 @@ class Studio:
         self.task, self.agent, self.env, self.seed, self.tell = task, agent, env, seed, tell
         self.pictures: dict[str, Picture] = {}
         self.clips: dict[int, Picture] = {}
-        whole = max(round(HELD.get(task.family, 2.0) / task.step_seconds / agent.horizon), 1)
+        whole = max(round(view_of(task).held / task.step_seconds / agent.horizon), 1)
         self.steps = whole * agent.horizon
 
     def keep(self, name: str, figure: Figure, caption: str, alt: str) -> None:
@@ -142,7 +140,7 @@ class Studio:
                 "left the panel.",
                 f"{len(states)} close-ups of the maze, each with the paths of {len(used)} skills from one start.",
             )
-        if has_limbs(task):
+        if view_of(task).limbs:
             self._movement(table, used, made, clips=not maze_like)
 
     def _movement(self, table: pd.DataFrame, used: NDArray[Any], made: Replays, clips: bool) -> None:
@@ -154,7 +152,7 @@ class Studio:
         chosen = [int(code) for code in used[rows]]
         own = made.take(made.states == state)
         bodies = {int(code): body_frames(model, qpos) for code, qpos in zip(own.codes, own.qpos, strict=True)}
-        every = max(self.steps // BODIES.get(self.task.family, 6), 1)
+        every = max(self.steps // view_of(self.task).bodies, 1)
         moments = (
             f"a body every {every * self.task.step_seconds:.2g} s, the last one solid, lines are the ways of joints"
         )

@@ -23,10 +23,10 @@ from dds_lightning.interpret.draw.drawing import (
     panel_height,
 )
 from dds_lightning.interpret.draw.palette import NO_SKILL, SKILL_COLOURS, WALL, ink, skill_colour
-from dds_lightning.interpret.measure.body import path_names
 from dds_lightning.interpret.measure.statistics import telling_dimensions
+from dds_lightning.interpret.views import view_of
 from dds_lightning.tasks import Task
-from dds_lightning.tasks.columns import observation_names
+from dds_lightning.tasks.bodies import observation_names
 
 if TYPE_CHECKING:
     from dds_lightning.interpret.measure.recovery import Recovery, RoundTrip
@@ -133,7 +133,7 @@ def plot_effects(task: Task, found: Recovery) -> Figure:
         task: where it was measured.
         found: of `recovery.code_recovery`.
     """
-    names = path_names(task)
+    names = view_of(task).path
     across, up = 0, len(names) - 1
     figure = Figure(figsize=(6.0, 5.4), layout="constrained")
     ax = figure.add_subplot()

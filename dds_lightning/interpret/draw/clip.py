@@ -1,7 +1,7 @@
 """A short clip of an episode in a maze, drawn without any graphics driver.
 
-The walls are drawn once. Every frame starts from that picture, adds what moved, and shares one table of colours with
-the others: that is what makes it fast and the file small.
+The walls are drawn once; every frame starts from that picture, adds what moved, and shares one colour table with the
+others. That makes it fast and the file small, which no animation writer of a library does (see `gif`).
 """
 
 from pathlib import Path

@@ -20,7 +20,7 @@ from dds_lightning.envs.kitchen import subtasks_done
 from dds_lightning.interpret.draw.drawing import draw_starts, draw_walls, goal_outline
 from dds_lightning.interpret.draw.palette import NO_SKILL, SKILL_COLOURS
 from dds_lightning.tasks import Task
-from dds_lightning.tasks.columns import action_names
+from dds_lightning.tasks.bodies import action_names
 
 LABEL, TICKS = 10.0, 9.0
 WIDTH, TITLE = 7.0, 0.3

@@ -7,6 +7,7 @@ where every backend fails, there are none, and the stick figures have to do.
 from __future__ import annotations
 
 import io
+import json
 import os
 import subprocess
 import sys
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from dds_lightning.errors import UserError
 from dds_lightning.interpret.draw.drawing import LABEL, grid, heading
-from dds_lightning.tasks import Task
+from dds_lightning.tasks import Task, facts_to_keep
 
 BACKENDS = ("egl", "osmesa", "glfw")
 """Tried in this order unless `MUJOCO_GL` names one."""
@@ -44,7 +45,7 @@ def render_frames(task: Task, qpos: NDArray[Any], width: int = 320, height: int 
     qpos = np.asarray(qpos, dtype=np.float64)
     qpos = qpos[np.isfinite(qpos).all(axis=1)]
     file = io.BytesIO()
-    np.savez(file, qpos=qpos, size=np.array([width, height]), task=np.array(task.name))
+    np.savez(file, qpos=qpos, size=np.array([width, height]), task=np.array(json.dumps(facts_to_keep(task))))
     wanted = os.environ.get("MUJOCO_GL", "").lower()
     path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
     for backend in (wanted,) if wanted else BACKENDS:
@@ -113,30 +114,30 @@ def worker() -> None:
     os._exit(0)  # a driver that fails while it is put away has done its work
 
 
-def _render(name: str, qpos: NDArray[np.float64], width: int, height: int) -> NDArray[np.uint8]:
+def _render(facts: str, qpos: NDArray[np.float64], width: int, height: int) -> NDArray[np.uint8]:
     import mujoco
 
     from dds_lightning.interpret.measure.replay import simulator
-    from dds_lightning.tasks import get_task
+    from dds_lightning.interpret.views import view_of
+    from dds_lightning.tasks import restore_task
 
     mujoco.GLContext(16, 16).free()  # without a driver it ends here, before anything slow
-    task = get_task(name)
+    task = restore_task(json.loads(facts), "the request")
+    assert task is not None, "the caller names it"
     with simulator(task) as env:
         model: Any = env.unwrapped.model
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         data = mujoco.MjData(model)
         renderer = mujoco.Renderer(model, height, width)
         camera = mujoco.MjvCamera()
-        camera.distance, camera.azimuth, camera.elevation = {
-            "kitchen": (2.4, 70.0, -30.0),
-            "antmaze": (4.5, 90.0, -88.0),
-        }.get(task.family, (2.5, 90.0, -6.0))
+        view = view_of(task)
+        camera.distance, camera.azimuth, camera.elevation = view.camera
         frames = []
         for row in qpos:
             data.qpos[:] = row
             mujoco.mj_forward(model, data)
             torso = data.xpos[model.jnt_bodyid[0]]
-            camera.lookat[:] = (-0.2, 0.5, 2.0) if task.family == "kitchen" else (torso[0], torso[1], 0.8)
+            camera.lookat[:] = view.looks_at or (torso[0], torso[1], view.eye)
             renderer.update_scene(data, camera)
             frames.append(renderer.render().copy())
     return np.stack(frames) if frames else np.zeros((0, height, width, 3), np.uint8)

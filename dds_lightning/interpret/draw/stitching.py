@@ -15,6 +15,7 @@ from dds_lightning.interpret.draw.drawing import LABEL, TICKS, crop, draw_path, 
 from dds_lightning.interpret.draw.palette import ink, skill_colour
 from dds_lightning.rollout.result import RolloutPath, RolloutResult
 from dds_lightning.tasks import Task
+from dds_lightning.tasks.bodies import body_of
 
 WIDTH = 7.0
 """Inches of a figure."""
@@ -76,7 +77,7 @@ def plot_stitching(task: Task, result: RolloutResult, actor: str, episodes: int 
     table = result.episodes[result.episodes["actor"] == actor].set_index("episode")
     rows = 0.3 * len(chosen) + 0.75
     mazes = min(MAZES, len(chosen)) if task.maze_map is not None else 0
-    course = task.family == "locomotion" and result.paths[actor, chosen[0]].observations is not None
+    course = body_of(task).moves == "course" and result.paths[actor, chosen[0]].observations is not None
     tall = panel_height(task, WIDTH / MAZES - 0.55) + 0.55 if mazes else 1.7 if course else 0.0
     figure = Figure(figsize=(WIDTH, rows + tall + 0.35), layout="constrained")
     words = "the skill in use"

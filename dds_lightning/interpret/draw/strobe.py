@@ -18,7 +18,8 @@ from dds_lightning.errors import UserError
 from dds_lightning.interpret.draw.drawing import LABEL, TICKS, draw_walls, grid, heading
 from dds_lightning.interpret.draw.gif import Still, gif_bytes
 from dds_lightning.interpret.draw.palette import NO_SKILL, WALL, skill_colour
-from dds_lightning.interpret.measure.body import ABOVE, BodyFrames, View, view_of
+from dds_lightning.interpret.measure.body import BodyFrames
+from dds_lightning.interpret.views import View, view_of
 from dds_lightning.tasks import Task
 
 WIDTH = 7.0
@@ -68,10 +69,10 @@ def plot_strobes(
         for t in range(last % every, last + 1, every):  # the last one is always there
             colour = to_rgba(skill_colour(code), FAINTEST + (1 - FAINTEST) * (t / max(last, 1)) ** 1.5)
             _draw_body(ax, view, body, t, colour)
-        faint = 0.35 if view == ABOVE else 0.8  # an ant has many joints
+        faint = 0.35 if view.axes == (0, 1) else 0.8  # an ant has many joints
         for path in np.moveaxis(body.joints[:, :, view.axes], 1, 0):  # (J, T + 1, 2)
             ax.plot(*path.T, color=NO_SKILL, linewidth=0.7, alpha=faint, zorder=4)
-        if view == ABOVE:
+        if view.axes == (0, 1):
             ax.plot(*body.root[:, view.axes].T, color="black", linewidth=1.2, zorder=5)
         if len(body.names):
             _draw_objects(ax, view, body, skill_colour(code))

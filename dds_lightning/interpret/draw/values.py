@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from dds_lightning.errors import UserError
 from dds_lightning.interpret.draw.drawing import LABEL, draw_number, draw_walls, maze_figure
-from dds_lightning.interpret.measure.replay import at_rest, replay_codes, rest_states
+from dds_lightning.interpret.measure.replay import replay_codes
+from dds_lightning.interpret.measure.states import at_rest, rest_states
 from dds_lightning.tasks import Task
 
 if TYPE_CHECKING:

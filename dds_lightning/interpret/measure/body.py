@@ -11,13 +11,15 @@ No picture is rendered, so no graphics driver is needed.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from dds_lightning.interpret.views import view_of
 from dds_lightning.tasks import Task
+from dds_lightning.tasks.bodies import body_of
 
 ARM = 9
 """Joints of the kitchen's robot; those after them move its objects."""
@@ -34,35 +36,6 @@ THINGS = {
 """Bodies of the kitchen's model to what they are called; knobs and burners have their own names."""
 
 Floats = NDArray[np.float64]
-
-
-class View(NamedTuple):
-    """From where a body is drawn.
-
-    Attributes:
-        axes: which of x, y, z run to the right and up.
-        labels: of the two axes.
-        ground: whether the ground is the line z = 0.
-    """
-
-    axes: tuple[int, int]
-    labels: tuple[str, str]
-    ground: bool
-
-
-SIDE = View((0, 2), ("x (m)", "z (m)"), True)
-ABOVE = View((0, 1), ("x (m)", "y (m)"), False)
-FRONT = View((0, 2), ("x (m)", "z (m)"), False)
-
-
-def view_of(task: Task) -> View:
-    """A runner is seen from the side, an ant from above, the kitchen from behind the robot."""
-    return {"locomotion": SIDE, "kitchen": FRONT}.get(task.family, ABOVE)
-
-
-def has_limbs(task: Task) -> bool:
-    """Whether there is more to draw than a point."""
-    return task.family != "pointmaze"
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +139,7 @@ def root_path(task: Task, model: Any, qpos: NDArray[Any]) -> Floats:
     Returns:
         (N, T + 1, D) metres: x and y in a maze, x and z of a runner, x, y and z of the kitchen's hand; NaN as `qpos`.
     """
-    if task.family != "kitchen":
+    if not view_of(task).hand:
         return np.asarray(qpos[..., :2], dtype=np.float64)
     flat = qpos.reshape(-1, qpos.shape[-1])
     known = np.isfinite(flat).all(axis=1)
@@ -185,22 +158,9 @@ def to_body(task: Task, away: NDArray[Any], quaternions: NDArray[Any]) -> Floats
         quaternions: (..., 4) an ant's attitude, w first; anything of other bodies.
     """
     away = np.asarray(away, dtype=np.float64)
-    if task.family != "antmaze":
+    if body_of(task).heading is None:
         return away
     w, x, y, z = np.moveaxis(np.asarray(quaternions, dtype=np.float64), -1, 0)
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
     ahead = np.cos(yaw) * away[..., 0] + np.sin(yaw) * away[..., 1]
     return np.stack([ahead, np.cos(yaw) * away[..., 1] - np.sin(yaw) * away[..., 0]], axis=-1)
-
-
-PATH_NAMES = {
-    "locomotion": ("along x", "along z"),
-    "kitchen": ("along x", "along y", "along z"),
-    "antmaze": ("ahead of the ant", "to its left"),
-}
-"""Names of the D coordinates of `root_path` after `to_body`; of a point along x and y."""
-
-
-def path_names(task: Task) -> tuple[str, ...]:
-    """Names of the coordinates of `root_path` after `to_body`."""
-    return PATH_NAMES.get(task.family, ("along x", "along y"))

@@ -19,7 +19,8 @@ from datamodules.relabel import check_widths
 from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError
 from dds_lightning.interpret.measure.recovery import code_recovery, round_trip
-from dds_lightning.interpret.measure.replay import draw_states, simulator
+from dds_lightning.interpret.measure.replay import simulator
+from dds_lightning.interpret.measure.states import draw_states
 from dds_lightning.tasks import Task
 
 if TYPE_CHECKING:
@@ -40,8 +41,8 @@ class ClusteredSkills:
 
     def encode(self, observations: Tensor, actions: Tensor, lengths: Tensor | None = None) -> Tensor:
         """The nearest centre (B,) of each segment's mean encoding."""
-        found: Any = self.skill.encode_segments(observations, actions, lengths)
-        return torch.cdist(found.mean.float(), self.centres).argmin(dim=-1)
+        found = self.skill.encode_segments(observations, actions, lengths)
+        return torch.cdist(found.vectors.float(), self.centres).argmin(dim=-1)
 
     def decode(
         self,
@@ -78,8 +79,8 @@ def cluster_skills(
     skill.eval()
     means = []
     for observations, actions in _segments(trajectories, skill.horizon, segments, seed, skill.device):
-        found: Any = skill.encode_segments(observations, actions)
-        means.append(found.mean.float().cpu().numpy())
+        found = skill.encode_segments(observations, actions)
+        means.append(found.vectors.float().cpu().numpy())
     encodings = np.concatenate(means)
     if len(encodings) < clusters:
         raise UserError(f"clusters is {clusters}, but the data have only {len(encodings)} segments: ask for fewer")
@@ -130,8 +131,8 @@ def decoding_error(
             held = skill.encode(observations, actions).repeat_interleave(horizon)
             decoded = skill.decode(seen, held, 1.0, stream)
         else:
-            found: Any = model.encode_segments(observations, actions)
-            decoded = model.decode_vectors(seen, found.mean.repeat_interleave(horizon, dim=0), 1.0, stream)
+            found = model.encode_segments(observations, actions)
+            decoded = model.decode_vectors(seen, found.vectors.repeat_interleave(horizon, dim=0), 1.0, stream)
         squares.append((decoded - actions.flatten(0, 1)).square().mean(dim=-1))
     return float(torch.cat(squares).mean().sqrt())
 

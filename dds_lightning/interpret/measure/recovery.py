@@ -28,7 +28,8 @@ from numpy.typing import NDArray
 from datamodules.trajectories import Trajectories
 from dds_lightning.interpret.measure.body import root_path, to_body
 from dds_lightning.interpret.measure.information import mutual_information
-from dds_lightning.interpret.measure.replay import BodyStates, Replays, Skills, body_states, replay_codes, simulator
+from dds_lightning.interpret.measure.replay import Replays, Skills, replay_codes, simulator
+from dds_lightning.interpret.measure.states import BodyStates, states_at
 from dds_lightning.tasks import Task
 
 POOL = 4000
@@ -190,9 +191,7 @@ def round_trip(
     segments = min(segments, int(counts.max()))
     chosen = np.flatnonzero(counts >= segments)
     drawn = np.concatenate([rng.choice(np.flatnonzero(codes == k), segments, replace=False) for k in chosen])
-    first = np.isin(rows[drawn], trajectories.observation_offsets)
-    before = np.where(first[:, None], np.nan, trajectories.observations[np.maximum(rows[drawn] - 1, 0)])
-    states = body_states(task, seen[drawn, 0], before)
+    states = states_at(task, trajectories, rows[drawn])
     held = codes[drawn]
     other = chosen[(np.searchsorted(chosen, held) + rng.integers(1, max(len(chosen), 2), len(held))) % len(chosen)]
     with contextlib.ExitStack() as stack:

@@ -23,10 +23,11 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from datamodules.physics.states import state_layout
 from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError
-from dds_lightning.tasks import Cell, Task
+from dds_lightning.interpret.measure.states import BodyStates, Played
+from dds_lightning.tasks import Task
+from dds_lightning.tasks.env import open_env
 
 Act = Callable[[NDArray[np.float32], NDArray[np.intp]], NDArray[np.float32]]
 """Observations (n, O) of the replays numbered `rows` (n,) to actions (n, A)."""
@@ -51,30 +52,6 @@ class Skills(Protocol):
         generator: torch.Generator | None = None,
     ) -> Tensor:
         """Actions (B, A) for observations (B, O) under codes (B,)."""
-
-
-@dataclass(frozen=True, eq=False)
-class BodyStates:
-    """S states of a task's simulator.
-
-    Attributes:
-        observations: (S, O) float32, as the task's environment gives them.
-        qpos: (S, nq).
-        qvel: (S, nv).
-    """
-
-    observations: NDArray[np.float32]
-    qpos: NDArray[np.float64]
-    qvel: NDArray[np.float64]
-
-    def __len__(self) -> int:
-        """S."""
-        return len(self.qpos)
-
-    def take(self, index: ArrayLike) -> BodyStates:
-        """The states numbered `index`, in that order."""
-        rows = np.asarray(index)
-        return BodyStates(self.observations[rows], self.qpos[rows], self.qvel[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,102 +87,20 @@ class Replays:
         return Replays(**{name: values[rows] for name, values in vars(self).items()})
 
 
-# ---------------------------------------------------------------------- states to begin in
-
-
-def body_states(task: Task, observations: ArrayLike, previous: ArrayLike | None = None) -> BodyStates:
-    """The simulator's states behind some observations.
-
-    What an observation leaves out is filled in: a runner stands at x = 0, on which no force depends; a kitchen whose
-    observations hold no velocities moves as from the previous observation, or is at rest.
-
-    Args:
-        task: whose observations.
-        observations: (S, O).
-        previous: (S, O) a step earlier; NaN rows where there is none.
-    """
-    seen = np.asarray(observations, dtype=np.float64)
-    layout = state_layout(task, seen.shape[1])
-    positions = list(layout.positions)
-    qpos = np.pad(seen[:, positions], ((0, 0), (layout.hidden, 0)))
-    qvel = np.zeros((len(seen), layout.degrees))
-    if layout.velocities:
-        qvel[:] = seen[:, list(layout.velocities)]
-    elif previous is not None:
-        # Joints alone: of the kettle's seven position numbers four are a quaternion, and it mostly stands.
-        joints = np.nan_to_num((seen - np.asarray(previous, dtype=np.float64))[:, positions]) / task.step_seconds
-        free = len(positions) - 7
-        qvel[:, :free] = joints[:, :free]
-    return BodyStates(np.asarray(observations, np.float32), qpos, qvel)
-
-
-def draw_states(task: Task, trajectories: Trajectories, count: int, seed: int = 0) -> BodyStates:
-    """Draw states from all over a data set, none of them an episode's last.
-
-    Args:
-        task: what the data are of.
-        trajectories: the data.
-        count: S; fewer come back from shorter data.
-        seed: of the draw.
-    """
-    rng = np.random.default_rng(seed)
-    steps = np.sort(rng.choice(trajectories.num_steps, min(count, trajectories.num_steps), replace=False))
-    rows = steps + trajectories.episode_of(steps)
-    previous = trajectories.observations[np.maximum(rows - 1, 0)].astype(np.float64)
-    previous[np.isin(rows, trajectories.observation_offsets)] = np.nan
-    return body_states(task, trajectories.observations[rows], previous)
-
-
-def rest_states(task: Task, cells: Sequence[Cell]) -> BodyStates:
-    """The body at rest in the middle of some cells of a maze, an ant upright.
-
-    Raises:
-        UserError: the task has no maze.
-    """
-    return body_states(task, at_rest(task, task.cell_to_xy(list(cells))))
-
-
-def at_rest(task: Task, points: ArrayLike) -> NDArray[np.float32]:
-    """Observations (N, O) of a body at rest at positions (N, 2) in metres, an ant upright as its episodes begin."""
-    observations = np.zeros((len(np.asarray(points)), task.observation_dim), np.float32)
-    observations[:, :2] = points
-    if task.family == "antmaze":
-        observations[:, 2:4] = 0.75, 1.0  # height, and w of the quaternion
-    return observations
-
-
-def junctions(task: Task, count: int = 8) -> tuple[Cell, ...]:
-    """A maze's start, then cells with several ways out, each as far as can be from those before it.
-
-    The goal's cell is left out: there every episode is over at once.
-    """
-    free = set(task.free_cells()) - {task.goal_cell}
-
-    def ways(place: Cell) -> int:
-        i, j = place
-        return sum(neighbour in free for neighbour in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)))
-
-    assert task.start_cell is not None, "mazes have a start"
-    chosen = [task.start_cell]
-    for least in (3, 2, 1):  # where several ways lead on, skills differ most
-        places = [place for place in task.free_cells() if place in free and ways(place) >= least]
-        while len(chosen) < min(count, len(free)) and (rest := [p for p in places if p not in chosen]):
-            chosen.append(max(rest, key=lambda p: min(abs(p[0] - c[0]) + abs(p[1] - c[1]) for c in chosen)))
-    return tuple(chosen)
-
-
 # ---------------------------------------------------------------------- playing
 
 
 @contextlib.contextmanager
 def simulator(task: Task) -> Iterator[Any]:
-    """The task's environment after a reset; `unwrapped` has its `model` and `data`."""
-    env = task.make_env()
-    try:
-        env.reset(seed=0)
+    """The task's environment after a reset; `unwrapped` has its `model` and `data`.
+
+    Raises:
+        UserError: It is not simulated by MuJoCo.
+    """
+    with open_env(task) as env:
+        if not hasattr(env.unwrapped, "model"):
+            raise UserError(f"task '{task.name}': {task.env_id} has no MuJoCo model, so no skill can be replayed in it")
         yield env
-    finally:
-        env.close()
 
 
 def replay_codes(
@@ -303,3 +198,43 @@ def _play(
         if report is not None:
             report(t + 1)
     return {"observations": observations, "actions": actions, "rewards": rewards, "qpos": qpos, "alive": alive}
+
+
+def play_skills(task: Task, skills: Skills, steps: int = 2000, seed: int = 0) -> Played:
+    """Episodes of random skills: states to replay from where no observation holds the simulator's state.
+
+    Args:
+        task: The environment.
+        skills: Whose decoder plays.
+        steps: At least so many in all.
+        seed: Of the codes and of the decoder's noise.
+    """
+    rng, stream = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
+    episodes: list[dict[str, Any]] = []
+    qpos, qvel = [], []
+    with simulator(task) as env, torch.inference_mode():
+        data = env.unwrapped.data
+        while sum(len(episode["rewards"]) for episode in episodes) < steps:
+            observation, _ = env.reset(seed=int(rng.integers(2**31)))
+            seen, ended = [observation], False
+            taken: list[Any] = []
+            rewards: list[float] = []
+            qpos.append(data.qpos.copy())
+            qvel.append(data.qvel.copy())
+            while not ended and len(taken) < task.max_episode_steps:
+                if len(taken) % skills.horizon == 0:
+                    code = torch.from_numpy(rng.integers(skills.num_skills, size=1))
+                action = skills.decode(torch.from_numpy(observation[None]), code, None, stream)[0].float().numpy()
+                observation, reward, ended, *_ = env.step(action)
+                seen.append(observation)
+                taken.append(action)
+                rewards.append(reward)
+                qpos.append(data.qpos.copy())
+                qvel.append(data.qvel.copy())
+            last = np.arange(len(taken)) == len(taken) - 1
+            arrays = {"observations": np.array(seen), "actions": np.array(taken), "rewards": np.array(rewards)}
+            episodes.append({**arrays, "terminations": last & ended, "truncations": last & (not ended)})
+    name = f"{task.name}, played"
+    made = Trajectories.from_episodes(name, episodes, action_low=task.action_low, action_high=task.action_high)
+    fields: dict[str, Any] = {"name": name, **made.arrays(), "qpos": np.array(qpos), "qvel": np.array(qvel)}
+    return Played(**fields)

@@ -17,7 +17,7 @@ from datamodules.relabel import Relabelled, relabel
 from datamodules.trajectories import Trajectories
 from dds_lightning.interpret.measure.body import to_body
 from dds_lightning.tasks import Task
-from dds_lightning.tasks.columns import observation_names
+from dds_lightning.tasks.bodies import Body, body_of, observation_names
 
 if TYPE_CHECKING:
     from dds_lightning.policy import PolicyModule
@@ -131,8 +131,8 @@ def segment_effects(task: Task | None, segments: CodedSegments) -> pd.DataFrame:
 
 
 def _movement(task: Task | None, seen: Floats, lengths: NDArray[np.int64], seconds: Floats) -> dict[str, Floats]:
-    family = "" if task is None else task.family
-    if family == "locomotion":
+    body = Body() if task is None else body_of(task)
+    if body.moves == "course":
         assert task is not None
         names = observation_names(task)
         speed = seen[:, :-1, names.index("x velocity (m/s)")]
@@ -141,16 +141,17 @@ def _movement(task: Task | None, seen: Floats, lengths: NDArray[np.int64], secon
         dz = seen[:, -1, 0] - seen[:, 0, 0]
         turn = np.degrees(seen[:, -1, 1] - seen[:, 0, 1])
         return {"dx": dx, "dz": dz, "distance": np.hypot(dx, dz), "speed": dx / seconds, "turn": turn}
-    if family in ("pointmaze", "antmaze"):
+    if body.moves == "plane":
         path = seen[:, :, :2]
         moved = path[:, -1] - path[:, 0]
         length = np.linalg.norm(np.diff(path, axis=1), axis=-1).sum(axis=1)
         away = {"dx": moved[:, 0], "dy": moved[:, 1], "distance": np.linalg.norm(moved, axis=1)}
-        if family == "antmaze":
+        if body.heading is not None:
             assert task is not None
-            away["ahead"], away["left"] = to_body(task, moved, seen[:, 0, 3:7]).T
+            attitude = seen[:, 0, body.heading : body.heading + 4]
+            away["ahead"], away["left"] = to_body(task, moved, attitude).T
         return {**away, "speed": length / seconds, "turn": _turn(path)}
-    columns = slice(0, 9) if family == "kitchen" else slice(None)
+    columns = slice(*body.moving) if body.moving else slice(None)
     distance = np.linalg.norm(seen[:, -1, columns] - seen[:, 0, columns], axis=1)
     return {"distance": distance, "speed": distance / seconds}
 

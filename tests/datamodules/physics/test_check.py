@@ -14,12 +14,13 @@ import pytest
 
 from datamodules import load_trajectories
 from datamodules.physics.check import LIMIT, NOISY_LIMIT, replay_check
-from datamodules.physics.states import FALLS, draw_steps, state_layout
-from datamodules.sources import rows as recordings
+from datamodules.physics.states import FALLS, draw_steps
+from datamodules.sources import d4rl, minari
 from datamodules.validation import DataError
 from dds_lightning.cli import main
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import get_task
+from dds_lightning.tasks.bodies import state_layout
 from tests.minari_recordings import write_minari_set
 from tests.recordings import Episode, record, write_d4rl_file
 
@@ -316,13 +317,14 @@ def test_steps_that_start_with_a_cut_velocity_are_left_out_unless_the_simulators
 
 
 def test_no_more_is_read_than_the_steps_need(written: Write, monkeypatch: pytest.MonkeyPatch) -> None:
-    read, spans = recordings.read_rows, []
+    read, spans = d4rl.read_rows, []
 
     def spy(dataset: Any, where: str, start: int, stop: int, *rest: Any) -> Any:
         spans.append(stop - start)
         return read(dataset, where, start, stop, *rest)
 
-    monkeypatch.setattr(recordings, "read_rows", spy)
+    for module in (d4rl, minari):
+        monkeypatch.setattr(module, "read_rows", spy)
     for source in ("d4rl", "minari"):
         draw_steps(written(source, "antmaze-umaze"), get_task("antmaze-umaze"), 20)
     assert max(spans) == 2
@@ -331,7 +333,7 @@ def test_no_more_is_read_than_the_steps_need(written: Write, monkeypatch: pytest
 
 def test_of_many_episodes_some_are_looked_into(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     task = get_task("pointmaze-umaze-play")
-    monkeypatch.setattr(recordings, "EPISODES", 3)
+    monkeypatch.setattr(minari, "EPISODES", 3)
     folder = write_minari_set(tmp_path, "set-v0", task, record(task, 100, episode_steps=10))
     assert len(draw_steps(f"local:{folder}", task, 100).rewards) == 30
 
@@ -361,8 +363,8 @@ def test_a_recording_that_tells_nothing_is_refused(written: Write) -> None:
     [
         (lambda file: file.pop("actions"), "'actions' is missing"),
         (lambda file: _replace(file, "actions", h5py.SoftLink("/rewards")), "'actions' is a link to elsewhere"),
-        (lambda file: _replace(file, "observations", np.zeros((20, 4))), "found 4 columns, task 'hopper-medium' needs"),
-        (lambda file: _replace(file, "rewards", np.zeros(7)), "observations: found shape"),
+        (lambda file: _replace(file, "observations", np.zeros((20, 4))), "got 4 columns, task 'hopper-medium' needs"),
+        (lambda file: _replace(file, "rewards", np.zeros(7)), "observations: got shape"),
         (lambda file: _replace(file, "infos", h5py.ExternalLink("other.hdf5", "/")), "'infos' is a link to elsewhere"),
     ],
 )

@@ -11,8 +11,9 @@ from matplotlib.colors import to_rgba
 from dds_lightning.errors import UserError
 from dds_lightning.interpret.draw.palette import skill_colour
 from dds_lightning.interpret.draw.strobe import body_clip, plot_strobes
-from dds_lightning.interpret.measure.body import body_frames, path_names, root_path, to_body
+from dds_lightning.interpret.measure.body import body_frames, root_path, to_body
 from dds_lightning.interpret.measure.replay import simulator
+from dds_lightning.interpret.views import view_of
 from dds_lightning.tasks import get_task
 
 HOPPER = get_task("hopper-medium")
@@ -60,8 +61,8 @@ def test_an_ant_moves_ahead_and_to_its_left_wherever_it_faces():
     np.testing.assert_allclose(to_body(ANT, away, faces_y), [[2.0, 0.0], [0.0, 1.0]], atol=1e-12)
     np.testing.assert_allclose(to_body(ANT, away, np.array([1.0, 0, 0, 0])), away)
     np.testing.assert_array_equal(to_body(HOPPER, away, faces_y), away)
-    assert path_names(ANT) == ("ahead of the ant", "to its left")
-    assert path_names(HOPPER) == ("along x", "along z")
+    assert view_of(ANT).path == ("ahead of the ant", "to its left")
+    assert view_of(HOPPER).path == ("along x", "along z")
 
 
 def bodies(ax):

@@ -9,7 +9,8 @@ from dds_lightning.interpret.draw.charts import plot_comparison, plot_effects, p
 from dds_lightning.interpret.measure.comparison import cluster_skills, compare_recovery, decoding_error
 from dds_lightning.interpret.measure.information import mutual_information
 from dds_lightning.interpret.measure.recovery import code_recovery, displacements, encode_replays, round_trip
-from dds_lightning.interpret.measure.replay import Replays, rest_states, simulator
+from dds_lightning.interpret.measure.replay import Replays, simulator
+from dds_lightning.interpret.measure.states import rest_states
 from dds_lightning.tasks import get_task
 from tests.interpret.tiny import Compass, Deaf, recorded, tiny_skill
 
@@ -143,7 +144,7 @@ def test_continuous_skills_get_codes_by_the_nearest_centre(data):
     observations, actions = torch.randn(9, 5, 4), torch.zeros(9, 5, 2)
     codes = skills.encode(observations, actions)
     with torch.no_grad():
-        means = skill.encode_segments(observations, actions).mean
+        means = skill.encode_segments(observations, actions).vectors
     np.testing.assert_array_equal(codes, torch.cdist(means, skills.centres).argmin(dim=1))
     stream = [torch.Generator().manual_seed(0) for _ in range(2)]
     with torch.no_grad():

@@ -5,14 +5,8 @@ import pytest
 
 from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError
-from dds_lightning.interpret.measure.replay import (
-    body_states,
-    draw_states,
-    junctions,
-    replay_codes,
-    rest_states,
-    simulator,
-)
+from dds_lightning.interpret.measure.replay import replay_codes, simulator
+from dds_lightning.interpret.measure.states import body_states, draw_states, junctions, rest_states
 from dds_lightning.tasks import get_task
 from tests.interpret.tiny import Compass, Played, recorded, tiny_skill
 from tests.recordings import record

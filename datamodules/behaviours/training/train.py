@@ -1,7 +1,7 @@
 """Train a behaviour policy: `python -m datamodules.behaviours.train ant|hopper|walker2d|halfcheetah`.
 
-One process, one thread. Ctrl-C or SIGTERM stops after the current rollout with everything saved; `--resume` goes on.
-The folder fills with `curve.csv`, `snapshots/STEPS.safetensors` (the ladder) and `state.pt`.
+Runs in one process and one thread. Ctrl-C or SIGTERM stops after the current step with everything saved; `--resume`
+continues. The folder receives `curve.csv`, `snapshots/STEPS.safetensors` (the ladder) and `state.pt`.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import torch
 from dds_lightning.errors import UserError
 
 try:
+    from stable_baselines3 import PPO
     from stable_baselines3.common.callbacks import BaseCallback
 except ImportError as missing:
     raise UserError(
@@ -28,10 +29,8 @@ except ImportError as missing:
     ) from missing
 
 from datamodules.behaviours.training.ant_world import AntWorld
-from datamodules.behaviours.training.fast_ppo import FastPPO
 from datamodules.behaviours.training.learner import build_learner, export_policy, load_state, save_state
 from datamodules.behaviours.training.recipes import RECIPES, Recipe, get_recipe
-from datamodules.behaviours.training.worlds import World
 from dds_lightning.console.interrupts import caught, deferred, pending
 
 COLUMNS = ("steps", "hours", "return", "episode_steps", "speed", "falls_per_1000", "exploration", "steps_per_second")
@@ -39,25 +38,25 @@ EULER = int(mujoco.mjtIntegrator.mjINT_EULER)
 
 
 class Bookkeeper(BaseCallback):
-    """Writes the curve, the snapshots and the state; stops when a signal waits."""
+    """Writes the curve, the snapshots and the state; stops the training when a signal is pending."""
 
-    def __init__(self, recipe: Recipe, learner: FastPPO, out: Path, hours: float, every: int = 50_000) -> None:
+    def __init__(self, recipe: Recipe, learner: PPO, out: Path, hours: float, every: int = 50_000) -> None:
         super().__init__()
         self.learner: Any = learner
-        env: Any = learner.env
-        world: Any = env.unwrapped
+        world: Any = learner.env
         self.recipe, self.out, self.every = recipe, out, every
         self.hours_before, self.began = hours, time.process_time()
         self.falls, self.speeds = 0, 0.0
-        self.world: World = world
-        self.integrator = world.model.opt.integrator
+        self.world = world.unwrapped
+        self.models: list[mujoco.MjModel] = world.get_attr("model")
+        self.integrator = self.models[0].opt.integrator
         self.next_row = self.next_snapshot = self.next_state = 0
         self.spacing = max(recipe.steps // recipe.rungs, 1)
         self.last = (time.process_time(), 0)
 
     @property
     def hours(self) -> float:
-        """Hours of one core so far, those before a resumption included."""
+        """Hours of one core so far, including those before a resumption."""
         return self.hours_before + (time.process_time() - self.began) / 3600
 
     def _on_training_start(self) -> None:
@@ -68,7 +67,8 @@ class Bookkeeper(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         coarse = self.num_timesteps < self.recipe.coarse_steps
-        self.world.model.opt.integrator = EULER if coarse else self.integrator
+        for model in self.models:
+            model.opt.integrator = EULER if coarse else self.integrator
         if self.num_timesteps >= self.next_snapshot:
             self.snapshot()
             self.next_snapshot += self.spacing
@@ -86,7 +86,7 @@ class Bookkeeper(BaseCallback):
         return pending() is None
 
     def snapshot(self) -> None:
-        """Keep the policy of now."""
+        """Write the current policy."""
         facts = {
             "behaviour": self.recipe.name,
             "environment": self.recipe.world,
@@ -97,11 +97,11 @@ class Bookkeeper(BaseCallback):
         export_policy(self.learner, facts).save(self.out / "snapshots" / f"{self.num_timesteps:09d}.safetensors")
 
     def save(self) -> None:
-        """Write the state to go on from."""
+        """Write the state to resume from."""
         save_state(self.learner, self.out / "state.pt", {"hours": self.hours})
 
     def row(self) -> None:
-        """One row of curve.csv, and one line for whoever watches."""
+        """Append a row to curve.csv and print it."""
         episodes = list(self.learner.ep_info_buffer or [])
         now, then = time.process_time(), self.last
         ant = isinstance(self.world, AntWorld)
@@ -128,23 +128,26 @@ class Bookkeeper(BaseCallback):
 
 
 def train(recipe: Recipe, out: Path, *, seed: int = 0, resume: bool = False) -> int:
-    """Train until the recipe's steps are done or a signal comes.
+    """Train until the recipe's steps are done or a signal arrives.
 
     Args:
         recipe: What to train.
-        out: The folder; must be new unless `resume`.
-        seed: Of networks, environments and noise.
-        resume: Go on from `out/state.pt`.
+        out: The folder; must be new or empty unless `resume` is set.
+        seed: Seed of networks, environments and noise.
+        resume: Continue from `out/state.pt`.
 
     Returns:
-        Steps done in all.
+        Total number of steps, including those before a resumption.
+
+    Raises:
+        UserError: The folder is not empty, or there is no state to resume from.
     """
     torch.set_num_threads(1)
     state = out / "state.pt"
     if not resume and out.exists() and any(out.iterdir()):
-        raise UserError(f"out: {out} is not empty; add --resume to go on there, or name another folder")
+        raise UserError(f"out: {out} is not empty; add --resume to continue there, or choose another folder")
     if resume and not state.is_file():
-        raise UserError(f"resume: {state} does not exist; leave --resume out to begin")
+        raise UserError(f"resume: {state} does not exist; leave out --resume to start a new training")
     out.mkdir(parents=True, exist_ok=True)
     learner = build_learner(recipe, seed)
     hours = load_state(learner, state)["hours"] if resume else 0.0
@@ -162,13 +165,17 @@ def train(recipe: Recipe, out: Path, *, seed: int = 0, resume: bool = False) -> 
 
 
 def main() -> None:
-    """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Run the command line."""
+    parser = argparse.ArgumentParser(
+        "python -m datamodules.behaviours.train",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("behaviour", choices=RECIPES)
-    parser.add_argument("--steps", type=int, help="environment steps in place of the recipe's")
-    parser.add_argument("--out", type=Path, help="folder, by default runs/behaviours/NAME")
+    parser.add_argument("--steps", type=int, help="environment steps, instead of the recipe's")
+    parser.add_argument("--out", type=Path, help="output folder (default: runs/behaviours/NAME)")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--resume", action="store_true", help="go on from the folder's state.pt")
+    parser.add_argument("--resume", action="store_true", help="continue from the folder's state.pt")
     arguments = parser.parse_args()
     recipe = get_recipe(arguments.behaviour)
     if arguments.steps:

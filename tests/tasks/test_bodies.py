@@ -10,7 +10,7 @@ import pytest
 
 from dds_lightning.envs.build import build_env
 from dds_lightning.tasks import get_task, task_names
-from dds_lightning.tasks.columns import action_names, observation_names
+from dds_lightning.tasks.bodies import action_names, observation_names
 
 MODELS = {
     "halfcheetah-medium": "HalfCheetah-v4",

@@ -15,27 +15,22 @@ import numpy as np
 import pandas as pd
 
 from datamodules.behaviours.policy import MLPPolicy
-from datamodules.behaviours.training.evaluation import (
-    RunnerScore,
-    WalkScore,
-    score_navigator,
-    score_runner,
-    score_walker,
-)
+from datamodules.behaviours.training.evaluation import RunnerScore, score_navigator, score_runner, score_walker
 from datamodules.behaviours.training.recipes import RECIPES, Recipe, get_recipe
 from dds_lightning.errors import UserError
 from dds_lightning.saving.files import sha256, written_whole
+from dds_lightning.saving.templates import render
 from dds_lightning.tasks import get_task
 
 NOISES = (0.0, 0.1, 0.2)
-"""Deviations of action noise at which the Ant is scored."""
+"""Standard deviations of action noise at which the Ant is scored."""
 MAZES = "mazes-d4rl.csv"
-"""How the Ant did in mazes, beside its policies."""
+"""File beside the Ant's policies with its results in mazes."""
 
 
 @dataclass(frozen=True)
 class Rung:
-    """One policy of a ladder: its file's name, itself, and its scores without and with exploration."""
+    """One policy of a ladder: its file name, the policy, and its scores without and with exploration."""
 
     name: str
     policy: MLPPolicy
@@ -47,7 +42,7 @@ def snapshots(run: Path) -> list[MLPPolicy]:
     """All snapshots of a training, oldest first.
 
     Raises:
-        UserError: There are none.
+        UserError: There are no snapshots.
     """
     paths = sorted((run / "snapshots").glob("*.safetensors"))
     if not paths:
@@ -56,14 +51,14 @@ def snapshots(run: Path) -> list[MLPPolicy]:
 
 
 def choose_rungs(scores: list[float], count: int) -> list[int]:
-    """Indices of at most `count` snapshots whose scores are spread evenly from the first one's to the best one's.
+    """Choose at most `count` snapshots whose scores are spread evenly between the first and the best.
 
     Args:
-        scores: Of all snapshots, oldest first.
-        count: Rungs, first and best included.
+        scores: Scores of all snapshots, oldest first.
+        count: Number of rungs, including the first and the best.
 
     Returns:
-        Indices with rising scores; the last is the best.
+        Indices with rising scores; the last one is the best.
     """
     best = int(np.argmax(scores))
     chosen = {0, best}
@@ -73,10 +68,10 @@ def choose_rungs(scores: list[float], count: int) -> list[int]:
 
 
 def ladder(recipe: Recipe, run: Path, *, rungs: int = 9, episodes: int = 20) -> list[Rung]:
-    """Score a runner's snapshots and keep some of them.
+    """Score a runner's snapshots and choose a ladder of them.
 
-    All are scored on a few episodes, the chosen ones again on others: a snapshot that was lucky once does not stay
-    lucky. The three best compete for the last rung.
+    All are scored on a few episodes, and the chosen ones again on different episodes, so that a snapshot that was
+    lucky once does not stay lucky. The three best compete for the last rung.
     """
     policies = snapshots(run)
     first = [score_runner(policy, recipe.name, episodes=10, seed=1_000).score for policy in policies]
@@ -100,11 +95,14 @@ def publish(recipe: Recipe, run: Path, out: Path, note: str = "") -> Path:
     Args:
         recipe: What was trained.
         run: The training's folder.
-        out: Where the folder goes.
-        note: One more sentence for the card, such as where this training departed from the recipe.
+        out: The parent folder.
+        note: A further sentence for the card, for example where this training departed from the recipe.
 
     Returns:
         The folder.
+
+    Raises:
+        UserError: The training has no snapshots.
     """
     ant = recipe.world.startswith("ant:")
     folder = out / ("ant" if ant else recipe.name)
@@ -126,21 +124,21 @@ def publish(recipe: Recipe, run: Path, out: Path, note: str = "") -> Path:
             rung.policy.save(folder / f"{rung.name}.safetensors")
         draw_curve(curve, "return", "return (with exploration)", folder / "curve.png")
         card = runner_card(recipe, built, note)
+    return write_card(folder, card)
+
+
+def write_card(folder: Path, text: str) -> Path:
+    """Write README.md and then SHA256SUMS of all other files; returns the folder."""
     with written_whole(folder / "README.md") as part:
-        part.write_text(card, encoding="utf-8")
-    write_sums(folder)
-    return folder
-
-
-def write_sums(folder: Path) -> None:
-    """SHA256SUMS of all other files."""
+        part.write_text(text, encoding="utf-8")
     files = sorted(path for path in folder.iterdir() if path.name != "SHA256SUMS" and not path.name.startswith("."))
     with written_whole(folder / "SHA256SUMS") as part:
         part.write_text("".join(f"{sha256(path)}  {path.name}\n" for path in files), encoding="utf-8")
+    return folder
 
 
 def draw_curve(curve: pd.DataFrame, column: str, label: str, path: Path) -> None:
-    """A small picture of the training."""
+    """Draw a column of the curve as a small picture."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(4.2, 2.4), layout="constrained")
@@ -154,77 +152,25 @@ def draw_curve(curve: pd.DataFrame, column: str, label: str, path: Path) -> None
         figure.savefig(part, dpi=90, format="png")
 
 
-def _walk_row(score: WalkScore) -> str:
-    return (
-        f"| {score.action_noise:g} | {score.speed:.2f} | {score.upright_speed:.2f} | {score.falls_per_1000:.3f} | "
-        f"{100 * score.on_its_back:.1f} % |"
-    )
-
-
 def ant_card(folder: Path) -> str:
-    """The card of the Ant's controllers, from the facts in their files."""
-    text = """# Ant controllers: they walk where they are told
-
-```python
-from datamodules.behaviours import AntController
-
-controller = AntController("d4rl")  # dds/AntMazeD4RL_*; "robotics" for AntMaze_*-v4, where it is shipped
-actions = controller.act(observations, headings)  # (B, 29), (B,) radians in the world frame -> (B, 8)
-```
-
-Each file is one policy in NumPy (128 x 128 tanh) with its observation statistics; its header says what it was trained
-on and how it scored. Scores: 64 Ants, one episode of 1,000 steps each on an endless floor, without resets; the heading
-is drawn anew, anywhere, every 10 to 80 steps (d4rl; 20 to 160 in robotics' half as long steps). A fall is a tilt of
-more than 90 degrees.
-"""
-    for path in sorted(folder.glob("*.safetensors")):
-        facts = MLPPolicy.load(path).metadata
-        rows = "\n".join(_walk_row(WalkScore(**score)) for score in facts["scores"])
-        text += f"""
-## {path.stem}
-
-| action noise | speed along the heading, m/s | before the first fall | falls per 1,000 steps | on its back at the end |
-| --: | --: | --: | --: | --: |
-{rows}
-
-{facts["algorithm"]}, {facts["steps"]:,} environment steps, {facts["hours"]:.2f} hours of one core:
-`python -m datamodules.behaviours.train {facts["behaviour"]}`, then
-`python -m datamodules.behaviours.publish {facts["behaviour"]}`.{" " + facts["note"] if facts["note"] else ""}
-
-![training curve](curve-{path.stem}.png)
-"""
-    mazes = folder / MAZES
-    return text + (maze_table(pd.read_csv(mazes)) if mazes.is_file() else "")
-
-
-def maze_table(walks: pd.DataFrame) -> str:
-    """The card's section on mazes, from the rows of `score_navigator`."""
-    rows = "\n".join(
-        f"| {row.maze} | {row.action_noise:g} | {100 * row.reached / row.episodes:.0f} % | {row.median_steps:.0f} | "
-        f"{row.cap} |"
-        for row in walks.itertuples(index=False)
-    )
-    return f"""
-## From the start to the goal of D4RL's mazes
-
-A planner over cells tells it where to walk (`AntNavigator`); {walks["episodes"].min()} episodes each, steps of those
-that reach the goal: `python -m datamodules.behaviours.publish ant --mazes {walks["episodes"].min()}`.
-
-| maze | action noise | reached | median steps | time-out |
-| --- | --: | --: | --: | --: |
-{rows}
-"""
+    """The card of the Ant's controllers, from the metadata in their files and the table of mazes, if there is one."""
+    policies = {path.stem: MLPPolicy.load(path).metadata for path in sorted(folder.glob("*.safetensors"))}
+    walks = pd.read_csv(folder / MAZES) if (folder / MAZES).is_file() else None
+    return render("datamodules.behaviours.training", "ant_card.md.jinja", {"policies": policies, "walks": walks})
 
 
 def publish_mazes(episodes: int, out: Path) -> Path:
     """Let the shipped Ant controller walk through D4RL's mazes and add the table to its card.
 
     Args:
-        episodes: Of each maze and noise.
-        out: Where the folder `ant` is.
+        episodes: Number of episodes for each maze and noise.
+        out: The parent of the folder `ant`.
 
     Returns:
         The folder.
+
+    Raises:
+        UserError: The folder has no controller for D4RL's physics.
     """
     folder = out / "ant"
     if not (folder / "d4rl.safetensors").is_file():
@@ -232,54 +178,26 @@ def publish_mazes(episodes: int, out: Path) -> Path:
     walks = score_navigator(NOISES, episodes=episodes)
     with written_whole(folder / MAZES) as part:
         walks.to_csv(part, index=False)
-    with written_whole(folder / "README.md") as part:
-        part.write_text(ant_card(folder), encoding="utf-8")
-    write_sums(folder)
-    return folder
+    return write_card(folder, ant_card(folder))
 
 
-def runner_card(recipe: Recipe, built: list[Rung], note: str) -> str:
+def runner_card(recipe: Recipe, rungs: list[Rung], note: str) -> str:
     """The card of a runner's ladder."""
-    task = get_task(f"{recipe.name}-medium")
-    rows = "\n".join(
-        f"| {rung.name} | {rung.policy.metadata['steps']:,} | {rung.score.score:.1f} | "
-        f"{rung.score.mean_return:.0f} ± {rung.score.std_return:.0f} | {rung.score.mean_steps:.0f} | "
-        f"{rung.sampled.score:.1f} |"
-        for rung in built
-    )
-    last = built[-1].policy.metadata
-    return f"""# {recipe.name}: a ladder of behaviour policies, random to expert
-
-```python
-from datamodules.behaviours import load_ladder
-
-policies = load_ladder("{recipe.name}")  # name -> policy, rising scores, the last one is "expert"
-actions = policies["expert"].act(observations)  # (B, {task.observation_dim}) -> (B, {task.action_dim})
-```
-
-Scores in {task.env_id}, {built[0].score.episodes} episodes each, normalised as D4RL does ({task.score_min:.0f} is 0,
-{task.score_max:.0f} is 100). "Sampled" draws actions with the noise that the policy had in training
-(`act(observations, rng)`); the other columns take its means.
-
-| file | training steps | score | return | episode length | score, sampled |
-| --- | --: | --: | --: | --: | --: |
-{rows}
-
-PPO, {last["steps"]:,} environment steps up to the expert, {last["hours"]:.2f} hours of one core:
-`python -m datamodules.behaviours.train {recipe.name}`, then `python -m datamodules.behaviours.publish {recipe.name}`.
-`sha256sum -c SHA256SUMS` checks the files.{" " + note if note else ""}
-
-![training curve](curve.png)
-"""
+    values = {"name": recipe.name, "task": get_task(f"{recipe.name}-medium"), "rungs": rungs, "note": note}
+    return render("datamodules.behaviours.training", "runner_card.md.jinja", values)
 
 
 def main() -> None:
-    """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Run the command line."""
+    parser = argparse.ArgumentParser(
+        "python -m datamodules.behaviours.publish",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("behaviour", choices=RECIPES)
-    parser.add_argument("--run", type=Path, help="the training's folder, by default runs/behaviours/NAME")
+    parser.add_argument("--run", type=Path, help="the training's folder (default: runs/behaviours/NAME)")
     parser.add_argument("--out", type=Path, default=Path("checkpoints/behaviours"))
-    parser.add_argument("--note", default="", help="one more sentence for the card")
+    parser.add_argument("--note", default="", help="a further sentence for the card")
     parser.add_argument("--mazes", type=int, metavar="EPISODES", help="only play the shipped Ant in D4RL's mazes")
     arguments = parser.parse_args()
     if arguments.mazes is not None and (arguments.mazes < 1 or arguments.behaviour != "ant"):

@@ -1,0 +1,89 @@
+"""One row a robot: how it is drawn, and in which units and words its movement is told.
+
+A new robot is one row here beside its row in `tasks.bodies`; a robot without a row is drawn from the side, as a body of
+limbs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dds_lightning.tasks import Task
+from dds_lightning.tasks.bodies import body_name
+
+
+@dataclass(frozen=True)
+class View:
+    """How a robot is drawn.
+
+    Attributes:
+        axes: Which of x, y, z run to the right and up in a stick figure.
+        ground: Whether the ground is the line z = 0.
+        limbs: Whether there is more to draw than a point.
+        held: Seconds that a skill is held to see what it does; whole skills are played.
+        bodies: Bodies between the first and the last of a stroboscopic picture.
+        camera: MuJoCo's camera: distance in metres, azimuth and elevation in degrees.
+        looks_at: Where the camera looks; None follows the body at the height `eye`.
+        eye: Height in metres.
+        path: Names of the coordinates of a replayed path, see `measure.body.root_path`.
+        hand: Whether the path is that of the robot's hand, in three dimensions.
+        units: Of displacement and of speed.
+        mover: What moves, in a sentence.
+        turn: Heading of the column of turns.
+        turns: What it means, in a sentence.
+    """
+
+    axes: tuple[int, int] = (0, 2)
+    ground: bool = False
+    limbs: bool = True
+    held: float = 2.0
+    bodies: int = 6
+    camera: tuple[float, float, float] = (2.5, 90.0, -6.0)
+    looks_at: tuple[float, float, float] | None = None
+    eye: float = 0.8
+    path: tuple[str, ...] = ("along x", "along y")
+    hand: bool = False
+    units: tuple[str, str] = ("m", "m/s")
+    mover: str = "the body"
+    turn: str = "turn"
+    turns: str = "it turns from the first half's way to the second's, left is positive"
+
+    @property
+    def labels(self) -> tuple[str, str]:
+        """Of the two axes of a stick figure."""
+        right, up = ("xyz"[axis] for axis in self.axes)
+        return f"{right} (m)", f"{up} (m)"
+
+
+RUNNER = View(
+    ground=True,
+    held=1.0,
+    bodies=8,
+    path=("along x", "along z"),
+    turn="pitch change",
+    turns="its pitch changes",
+)
+VIEWS = {
+    "halfcheetah": RUNNER,
+    "hopper": RUNNER,
+    "walker2d": RUNNER,
+    "antmaze": View(
+        axes=(0, 1), held=6.0, bodies=4, camera=(4.5, 90.0, -88.0), path=("ahead of the ant", "to its left")
+    ),
+    "pointmaze": View(axes=(0, 1), limbs=False, held=1.0),
+    "kitchen": View(
+        held=2.4,
+        camera=(2.4, 70.0, -30.0),
+        looks_at=(-0.2, 0.5, 2.0),
+        path=("along x", "along y", "along z"),
+        hand=True,
+        units=("rad", "rad/s"),
+        mover="its arm's joints",
+    ),
+}
+"""Name of a robot -> how it is drawn."""
+
+
+def view_of(task: Task) -> View:
+    """How a task's robot is drawn."""
+    return VIEWS.get(body_name(task), View())

@@ -1,0 +1,37 @@
+"""The task of a run directory, which keeps the definition of one that the table does not have."""
+
+from pathlib import Path
+
+import yaml
+
+from dds_lightning.errors import UserError
+from dds_lightning.saving.files import written_whole
+from dds_lightning.tasks import Task, definition, is_own, remember
+from dds_lightning.tasks.own import build_task
+
+TASK_FILE = "task.yaml"
+
+
+def keep_task(run: Path, task: Task) -> None:
+    """Write the definition of a task of one's own into a run directory; nothing for a task of the table."""
+    if is_own(task):
+        with written_whole(run / TASK_FILE) as part:
+            part.write_text(yaml.safe_dump(definition(task), sort_keys=False), encoding="utf-8")
+
+
+def recall_task(run: Path) -> None:
+    """Let the task that a run directory keeps be found by its name; nothing where it keeps none.
+
+    Raises:
+        UserError: The file is not a task's.
+    """
+    path = run / TASK_FILE
+    if not path.is_file():
+        return
+    try:
+        kept = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise UserError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(kept, dict):
+        raise UserError(f"{path} is not a mapping, expected the definition of a task")
+    remember(build_task(kept, str(path), trusted=False))

@@ -1,0 +1,220 @@
+"""Tasks of one's own: a YAML file, or a `Task` in a Python module, wherever the name of a task is taken.
+
+```yaml
+env_id: Reacher-v5            # any environment that Gymnasium knows, or "package:Name-v0" to import it first
+max_episode_steps: 50
+score_min: -43                # the return that scores 0, for example of random actions
+score_max: -4                 # the return that scores 100, for example of an expert
+```
+
+Whatever else a `Task` has may be given; widths and the box of actions are read from the environment where they are not.
+`positions` and `velocities` say which observations are the simulator's qpos and qvel, which `dds data check --replay`
+needs.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import re
+import sys
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from dds_lightning.errors import UserError
+from dds_lightning.tasks.bodies import BODIES, Body, StateLayout, has_state, state_layout
+from dds_lightning.tasks.task import Task
+
+LARGEST = 100_000
+"""Bytes of a task file."""
+GIVEN = (
+    *("name", "env_id", "env_options", "observation_dim", "action_dim", "action_low", "action_high"),
+    *("max_episode_steps", "step_seconds", "observation_layout", "family", "measures_success"),
+    *("reward_scale", "reward_shift", "score_min", "score_max", "evaluation_episodes"),
+)
+"""Attributes of a `Task` that a file may give."""
+STATE = ("positions", "velocities", "hidden")
+"""Where the simulator's state stands in an observation."""
+NEEDED = ("env_id", "max_episode_steps", "score_min", "score_max")
+FAMILY = "default"
+"""Preset of tasks that name none."""
+_KINDS: dict[str, tuple[str, type | tuple[type, ...]]] = {
+    "str": ("a text", str),
+    "int": ("a whole number", int),
+    "float": ("a number", (int, float)),
+    "bool": ("true or false", bool),
+    "Mapping[str, Any]": ("names with values", dict),
+}
+
+
+def is_address(name: str) -> bool:
+    """Whether a task's name says where its definition is: a YAML file, or `package.module:NAME`."""
+    return name.endswith((".yaml", ".yml")) or re.fullmatch(r"[\w.]+:\w+", name) is not None
+
+
+def load_task(address: str) -> Task:
+    """Read a task from a YAML file or from a Python module.
+
+    Args:
+        address: Path that ends in `.yaml`, or `package.module:NAME` of a `Task`. A module is code, and it is run.
+
+    Raises:
+        UserError: It cannot be read, or is not a task; the message names the field, what was found and what was
+            expected.
+    """
+    if not address.endswith((".yaml", ".yml")):
+        return _from_module(address)
+    path = Path(address).expanduser()
+    if not path.is_file():
+        raise UserError(f"task: there is no file {path}")
+    if path.stat().st_size > LARGEST:
+        raise UserError(f"task: {path} has {path.stat().st_size} bytes, expected at most {LARGEST}")
+    try:
+        given = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise UserError(f"task: {path} is not valid YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(given, dict):
+        raise UserError(f"task: {path} is not a mapping, expected for example env_id: Reacher-v5")
+    return build_task({"name": path.stem, **given}, str(path))
+
+
+def definition(task: Task) -> dict[str, Any]:
+    """A task of one's own as plain values, from which `build_task` makes it again."""
+    values: dict[str, Any] = {name: getattr(task, name) for name in GIVEN}
+    values["env_options"] = dict(values["env_options"])
+    if task.body == task.name and has_state(task):
+        layout = state_layout(task, task.observation_dim)
+        values |= {"positions": list(layout.positions), "velocities": list(layout.velocities), "hidden": layout.hidden}
+    return values
+
+
+def build_task(given: Mapping[str, Any], where: str, trusted: bool = True) -> Task:
+    """Make a task from the values of a file or of a `definition`.
+
+    Args:
+        given: Names to values; see `GIVEN` and `STATE`.
+        where: The file, for messages.
+        trusted: Whether `env_id` may name a module to import, and `env_options` files; not for what came with an
+            agent. The environment then is not built before it is played.
+
+    Raises:
+        UserError: See `load_task`.
+    """
+    for name in given:
+        if name not in (*GIVEN, *STATE):
+            near = difflib.get_close_matches(str(name), (*GIVEN, *STATE), n=1)
+            hint = f"did you mean {near[0]}?" if near else f"expected some of {', '.join((*GIVEN, *STATE))}"
+            raise UserError(f"task: {where} sets {name}, which is not known; {hint}")
+    if missing := [name for name in NEEDED if given.get(name) is None]:
+        raise UserError(f"task: {where} lacks {', '.join(missing)}")
+    types = {field.name: str(field.type) for field in fields(Task)}
+    values: dict[str, Any] = {}
+    for name in (name for name in GIVEN if given.get(name) is not None):
+        words, kind = _KINDS[types[name]]
+        value: Any = given[name]
+        if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+            raise UserError(f"task: {where} sets {name} to {value!r}, expected {words}")
+        values[name] = float(str(value)) if types[name] == "float" else value
+    _check(values, where, trusted)
+    asked = {} if not trusted and "observation_dim" in values else _read_environment(values, where)
+    values = {"family": FAMILY, "measures_success": False, **asked, **values}
+    task = Task(**values, body=values["name"])
+    layout = {name: given[name] for name in STATE if given.get(name) is not None}
+    BODIES[task.name] = _body(task, layout, where) if layout else Body()
+    return task
+
+
+def _check(values: Mapping[str, Any], where: str, trusted: bool) -> None:
+    pattern = r"([\w.]+:)?[\w./-]+" if trusted else r"[\w./-]+"
+    rules = [
+        ("name", re.fullmatch(r"[\w-]+", values["name"]) is not None, "letters, digits, '_' and '-'"),
+        ("env_id", re.fullmatch(pattern, values["env_id"]) is not None, "a name that Gymnasium knows"),
+        ("max_episode_steps", values["max_episode_steps"] >= 1, "at least 1"),
+        ("score_max", values["score_max"] > values["score_min"], f"more than score_min={values['score_min']}"),
+        *((name, values.get(name, 1) >= 1, "at least 1") for name in ("observation_dim", "action_dim")),
+        ("evaluation_episodes", values.get("evaluation_episodes", 1) >= 1, "at least 1"),
+        ("step_seconds", values.get("step_seconds", 1.0) > 0, "a positive number"),
+        ("reward_scale", values.get("reward_scale", 1.0) > 0, "a positive number"),
+    ]
+    for name, fine, expected in rules:
+        if not fine:
+            raise UserError(f"task: {where} sets {name} to {values[name]!r}, expected {expected}")
+    options = values.get("env_options", {})
+    if not trusted and not all(type(value) in (bool, int, float) for value in options.values()):
+        raise UserError(f"task: {where} sets env_options to {options!r}, expected numbers, true or false")
+    for name in ("score_min", "score_max", "reward_scale", "reward_shift", "action_low", "action_high"):
+        if not np.isfinite(values.get(name, 0.0)):
+            raise UserError(f"task: {where} sets {name} to {values[name]!r}, expected a finite number")
+
+
+def _read_environment(values: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Widths, the box of actions and the length of a step, by asking the environment.
+
+    Raises:
+        UserError: Gymnasium does not know it, or its spaces are not flat.
+    """
+    import gymnasium as gym
+
+    from dds_lightning.envs.build import build_env
+
+    try:
+        env = build_env(values["env_id"], **values.get("env_options", {}))
+    except (gym.error.Error, ImportError, TypeError, ValueError) as error:
+        raise UserError(f"task: {where} sets env_id to {values['env_id']}: {str(error).splitlines()[0]}") from None
+    try:
+        seen, taken = env.observation_space, env.action_space
+        for name, space in (("observations", seen), ("actions", taken)):
+            if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
+                raise UserError(
+                    f"task: {where}: the {name} of {values['env_id']} are {space}, expected a Box (n,); wrap the "
+                    "environment so that they are flat, and register it with Gymnasium"
+                )
+        assert isinstance(seen, gym.spaces.Box)
+        assert isinstance(taken, gym.spaces.Box)
+        low, high = np.unique(taken.low), np.unique(taken.high)
+        if "action_low" not in values and (len(low) > 1 or len(high) > 1 or not np.isfinite([*low, *high]).all()):
+            raise UserError(
+                f"task: {where}: the actions of {values['env_id']} have bounds {taken.low} to {taken.high}, expected "
+                "the same finite ones for every entry; rescale them with gymnasium.wrappers.RescaleAction"
+            )
+        found = {"observation_dim": seen.shape[0], "action_dim": taken.shape[0]}
+        for name, width in found.items():
+            if values.get(name, width) != width:
+                raise UserError(f"task: {where} sets {name} to {values[name]}, but {values['env_id']} has {width}")
+        seconds = getattr(env.unwrapped, "dt", None) or 1.0
+        return {**found, "action_low": float(low[0]), "action_high": float(high[0]), "step_seconds": float(seconds)}
+    finally:
+        env.close()
+
+
+def _body(task: Task, layout: Mapping[str, Any], where: str) -> Body:
+    """A robot whose observations hold the simulator's state where the file says."""
+    for name in STATE[:2]:
+        columns = layout.get(name)
+        if not isinstance(columns, list) or not all(type(c) is int and 0 <= c < task.observation_dim for c in columns):
+            expected = f"a list of columns of 0 to {task.observation_dim - 1}; give both positions and velocities"
+            raise UserError(f"task: {where} sets {name} to {columns!r}, expected {expected}")
+    hidden = layout.get("hidden", 0)
+    if type(hidden) is not int or hidden < 0:
+        raise UserError(f"task: {where} sets hidden to {hidden!r}, expected a number of positions that are left out")
+    names = tuple(f"observation {j}" for j in range(task.observation_dim))
+    positions, velocities = tuple(layout["positions"]), tuple(layout["velocities"])
+    return Body(layouts={0: StateLayout(names, positions, velocities, len(velocities), hidden)})
+
+
+def _from_module(address: str) -> Task:
+    module, _, name = address.partition(":")
+    if "" not in sys.path:
+        sys.path.insert(0, "")  # as `python -m` does: a module of the current folder
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise UserError(f"task: '{address}' cannot be imported: {error}") from None
+    if not isinstance(found, Task):
+        raise UserError(f"task: '{address}' is a {type(found).__name__}, expected a dds_lightning.tasks.Task")
+    return found

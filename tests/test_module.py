@@ -1,0 +1,59 @@
+"""What all stages share: the optimiser and its schedule."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torch import nn
+
+from dds_lightning.module import adam, learning_rate_factor
+
+
+@pytest.mark.parametrize(
+    ("step", "schedule", "warmup", "total", "expected"),
+    [
+        (0, "constant", 0, 100, 1.0),
+        (99, "constant", 0, 100, 1.0),
+        (0, "constant", 10, 100, 0.1),
+        (9, "constant", 10, 100, 1.0),
+        (10, "constant", 10, 100, 1.0),
+        (0, "cosine", 0, 100, 1.0),
+        (25, "cosine", 0, 100, 0.5 * (1 + math.sqrt(0.5))),
+        (50, "cosine", 0, 100, 0.5),
+        (100, "cosine", 0, 100, 0.0),
+        (150, "cosine", 0, 100, 0.0),  # further steps do not climb again
+        (55, "cosine", 10, 100, 0.5),  # half way between warm-up and end
+        (20, "cosine", 10, -1, 1.0),  # without an end there is nothing to decay to
+    ],
+)
+def test_the_learning_rate_warms_up_and_decays_as_documented(step, schedule, warmup, total, expected):
+    assert learning_rate_factor(step, schedule, warmup, total) == pytest.approx(expected, abs=1e-12)
+
+
+def test_adam_takes_the_learnable_parameters_at_the_given_rate_and_no_scheduler_unless_needed():
+    net = nn.Linear(2, 3)
+    net.bias.requires_grad_(False)
+    optimizer = adam(net.parameters(), 0.3, "constant", 0, SimpleNamespace())
+    assert [group["params"] for group in optimizer.param_groups] == [[net.weight]]
+    before = net.weight.detach().clone()
+    net.weight.grad = torch.tensor([[1.0, -2.0]] * 3)
+    optimizer.step()
+    # The first step of Adam is the rate times the gradient's sign.
+    torch.testing.assert_close(net.weight.detach() - before, torch.tensor([[-0.3, 0.3]] * 3))
+
+
+def test_each_group_follows_the_schedule_from_its_own_rate():
+    net = nn.ModuleList([nn.Linear(2, 2), nn.Linear(2, 2)])
+    groups = [{"params": list(part.parameters()), "lr": lr} for part, lr in zip(net, (0.1, 0.01), strict=True)]
+    module = SimpleNamespace(trainer=SimpleNamespace(max_steps=4))
+    configured = adam(groups, 0.1, "cosine", 0, module)
+    optimizer, scheduler = configured["optimizer"], configured["lr_scheduler"]["scheduler"]
+    assert configured["lr_scheduler"]["interval"] == "step"
+    rates = []
+    for _ in range(5):
+        rates.append([group["lr"] for group in optimizer.param_groups])
+        optimizer.step()
+        scheduler.step()
+    factors = [0.5 * (1 + math.cos(math.pi * step / 4)) for step in range(5)]
+    assert rates == [pytest.approx([0.1 * factor, 0.01 * factor]) for factor in factors]
