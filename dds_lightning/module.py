@@ -185,7 +185,9 @@ class StageModule(pl.LightningModule):
 
     def validation_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
         """Log how the model does on a held-out batch."""
-        self.evaluate(batch, "val")
+        with torch.random.fork_rng():  # the same noise every time: losses differ only by what was learnt
+            torch.manual_seed(batch_idx)
+            self.evaluate(batch, "val")
 
     def test_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
         """As `validation_step`."""

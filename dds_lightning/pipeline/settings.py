@@ -183,6 +183,10 @@ class Trainings:
         data = {key: value for key, value in config["data"].items() if key not in ("data", "skill", "cache")}
         best = {key: value for key, value in config["best"].items() if key != "every_n_steps" or value is not None}
         chosen = {"trainer": trainer, "model": config["model"], "data": data, "best": best}
+        if config["average"]["decay"] is not None:
+            chosen["average"] = config["average"]
+        if config["stop"]["when"] != "steps":
+            chosen["stop"] = config["stop"]
         return {"seed": config["seed_everything"], **chosen}
 
     def former_settings(self, stage: str) -> dict[str, Any]:

@@ -18,7 +18,9 @@ import yaml
 from jsonargparse import ArgumentError, Namespace
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 
+from dds_lightning.callbacks.average import AverageWeights
 from dds_lightning.callbacks.best import BestCheckpoint
+from dds_lightning.callbacks.convergence import Convergence
 from dds_lightning.callbacks.rolling import RollingCheckpoint
 from dds_lightning.configs import resolve_configs
 from dds_lightning.console.reports import Report, table
@@ -77,6 +79,8 @@ class StageCLI(LightningCLI):
         """Add the checkpoints' settings, `--json`, and the links from data to model."""
         parser.add_lightning_class_args(RollingCheckpoint, "checkpoint")
         parser.add_lightning_class_args(BestCheckpoint, "best")
+        parser.add_lightning_class_args(AverageWeights, "average")
+        parser.add_lightning_class_args(Convergence, "stop")
         parser.add_argument("--json", action="store_true", help="print one JSON document and nothing else")
         for name in self.stage.links:
             parser.link_arguments(f"data.{name}", f"model.{name}", apply_on="instantiate")

@@ -12,6 +12,7 @@ import lightning.pytorch as pl
 from lightning.pytorch.callbacks import Callback, Checkpoint, ProgressBar
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
+from dds_lightning.callbacks.average import AverageWeights
 from dds_lightning.callbacks.best import BestCheckpoint
 from dds_lightning.callbacks.guard import FiniteGuard
 from dds_lightning.callbacks.resume import ExactResume
@@ -75,6 +76,7 @@ def trainer_settings(config: dict[str, Any], extra: list[Callback]) -> dict[str,
         *(callback for callback in extra if saves or not isinstance(callback, Checkpoint)),
     ]
     callbacks = [c for c in callbacks if not (isinstance(c, BestCheckpoint) and c.monitor is None)]
+    callbacks = [c for c in callbacks if not (isinstance(c, AverageWeights) and c.decay is None)]
     rolling = next((c for c in callbacks if isinstance(c, RollingCheckpoint)), None)
     for callback in callbacks:
         if isinstance(callback, BestCheckpoint) and rolling is not None:
@@ -86,8 +88,10 @@ def trainer_settings(config: dict[str, Any], extra: list[Callback]) -> dict[str,
         isinstance(callback, ProgressBar) for callback in callbacks
     ):
         callbacks.append(StepProgress())
-    # Last of all: what others note at the same moment, the best score for example, belongs into its file.
-    config["callbacks"] = sorted(callbacks, key=lambda callback: isinstance(callback, RollingCheckpoint))
+    # Last of all the checkpoint: what others note at the same moment, the best score for example, belongs into its
+    # file. Just before it the average: it puts the training's own weights back when all have looked at the average.
+    last = (AverageWeights, RollingCheckpoint)
+    config["callbacks"] = sorted(callbacks, key=lambda c: 1 + last.index(type(c)) if type(c) in last else 0)
 
     plugins = config.get("plugins") or []
     plugins = list(plugins) if isinstance(plugins, list) else [plugins]
