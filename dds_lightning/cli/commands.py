@@ -71,7 +71,8 @@ def run(
         fresh: do every stage again
         **stages: settings for `dds STAGE fit` of each training stage, see above
     """
-    from dds_lightning.pipeline.run import RunSettings, run_all
+    from dds_lightning.pipeline.run import run_all
+    from dds_lightning.pipeline.settings import RunSettings
     from dds_lightning.tasks import get_task
 
     return run_all(

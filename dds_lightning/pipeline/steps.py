@@ -17,12 +17,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dds_lightning.pipeline.context import Run
 from dds_lightning.study import contestants, protocol
 from dds_lightning.tasks import facts_to_keep
 
 if TYPE_CHECKING:
     from dds_lightning.agent import DDSAgent
-    from dds_lightning.pipeline.run import Run
 
 Settings = dict[str, Any]
 
