@@ -61,9 +61,9 @@ def atlas(
     from dds_lightning.console.progress import announcements
     from dds_lightning.study.subject import atlas as make
 
-    with announcements(STAGES + len(against)) as tell:
+    with announcements(STAGES + len(against)) as announce:
         others, folder = [Path(one) for one in against], Path(figures) if figures else None
-        made, path = make(root, spec, task, page, episodes, others, seed, folder, tell)
+        made, path = make(root, spec, task, page, episodes, others, seed, folder, announce)
     found, trip, shown = made.recovery, made.trip, made.table[[name for name in SHOWN if name in made.table]]
     lines = [
         ("codes in use", f"{len(found.codes)} of {len(made.table)}"),

@@ -135,10 +135,10 @@ class Run:
         text: list[Any] = []
         shown = done
         if "report" in self._done:
-            from dds_lightning.study.report import told
+            from dds_lightning.study.report import summary_lines
 
             data |= self.facts("report")
-            text += told(self.facts("report"))
+            text += summary_lines(self.facts("report"))
             shown = [self._done["report"]]
             text.append(f"agent: {self.output('evaluate', 'agent')}")
         text += [f"{name}: {path}" for step in shown for name, path in step.outputs.items()]

@@ -54,7 +54,7 @@ def best_label(best: Mapping[str, Any]) -> str:
     return f"best of {best['evaluations']} evaluations while training, step {best['step']:,}: optimistic"
 
 
-def final_table(
+def final_contestants(
     agent: "DDSAgent",
     task: Task,
     episodes: int,

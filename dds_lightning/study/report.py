@@ -42,7 +42,7 @@ def write_report(run_dir: str | Path) -> dict[str, Any]:
         run_dir: A directory of `dds run`, evaluated.
 
     Returns:
-        Paths of the files by name, and the facts that `told` prints, as plain JSON values: `task`, `main` (the
+        Paths of the files by name, and the facts that `summary_lines` prints, as plain JSON values: `task`, `main` (the
         contestant that the run is about), `protocol` (see `protocol.protocol`; None of an older run), `table`
         (see `tables.summary_table`), `failures` (of the main contestant; see `tables.failures_table`) and
         `diagnosis` (see `diagnosis.diagnose`).
@@ -93,10 +93,10 @@ def report(run_dir: str | Path) -> Report:
 
     written = write_report(run_dir)
     paths = [f"{name}: {path}" for name, path in written.items() if isinstance(path, Path)]
-    return Report(written, [*told(written), *paths])
+    return Report(written, [*summary_lines(written), *paths])
 
 
-def told(facts: Mapping[str, Any]) -> list[RenderableType]:
+def summary_lines(facts: Mapping[str, Any]) -> list[RenderableType]:
     """Format the facts of `write_report` for a terminal: the table, and where the main contestant's failures ended."""
     from dds_lightning.console.reports import table
 

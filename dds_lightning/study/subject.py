@@ -11,7 +11,7 @@ from dds_lightning.agent import DDSAgent
 from dds_lightning.errors import UserError
 from dds_lightning.interpret.atlas.build import CONTINUOUS, DISCRETE, Atlas, make_atlas
 from dds_lightning.interpret.atlas.page import write_atlas, write_pictures
-from dds_lightning.interpret.atlas.pictures import Tell
+from dds_lightning.interpret.atlas.pictures import Announce
 from dds_lightning.rollout.actors import single_skills
 from dds_lightning.rollout.play import rollout
 from dds_lightning.rollout.result import RolloutResult
@@ -99,7 +99,7 @@ def atlas(
     against: Sequence[Path] = (),
     seed: int = 0,
     figures: Path | None = None,
-    tell: Tell = lambda words: None,
+    announce: Announce = lambda message: None,
 ) -> tuple[Atlas, Path]:
     """Create and write the atlas of a path; the arguments are those of `dds atlas`.
 
@@ -110,7 +110,7 @@ def atlas(
     from datamodules.relabel import check_widths
     from datamodules.sources import load_trajectories
 
-    tell("looking at the checkpoint")
+    announce("looking at the checkpoint")
     subject = find_subject(place, seed)
     spec, name = data or subject.data, task or subject.task
     if spec is None:
@@ -119,17 +119,19 @@ def atlas(
         raise UserError(f"{place} does not say which task it is for: give --task; `dds tasks` lists them")
     known = get_task(task) if task else known_task(name)  # a name from a file never opens another
     models = [SkillModule.load(path) for path in against]
-    tell("reading the data")
+    announce("reading the data")
     trajectories = load_trajectories(spec, known)
     wanted = trajectories.task
     assert wanted is not None
     for model in (subject.agent.skill, *models):
         check_widths(trajectories, model)
-    result, main, singles = _episodes(subject, wanted, episodes, seed, tell)
+    result, main, singles = _episodes(subject, wanted, episodes, seed, announce)
     others = [(DISCRETE if model.discrete else CONTINUOUS, model) for model in models]
-    made = make_atlas(subject.agent, wanted, trajectories, result, main, singles, others=others, seed=seed, tell=tell)
+    made = make_atlas(
+        subject.agent, wanted, trajectories, result, main, singles, others=others, seed=seed, announce=announce
+    )
     command = ["dds", "atlas", str(place), "--data", spec, "--task", wanted.name, "--seed", str(seed)]
-    tell("writing the page")
+    announce("writing the page")
     if figures is not None:
         write_pictures(made, figures, out.stem)
     about = _about(subject, wanted, spec, result, main)
@@ -137,7 +139,7 @@ def atlas(
 
 
 def _episodes(
-    subject: Subject, task: Task, episodes: int, seed: int, tell: Tell
+    subject: Subject, task: Task, episodes: int, seed: int, announce: Announce
 ) -> tuple[RolloutResult | None, str | None, str | None]:
     """Return episodes with their paths, and the names of policy and single skills: the run's, or played now."""
     found = subject.found
@@ -150,7 +152,7 @@ def _episodes(
     if agent.policy is not None:
         players.insert(0, way(agent, agent.selection, max(episodes, 1), agent.temperature))
         main = players[0].name
-    tell(f"playing {sum(player.episodes for player in players)} episodes")
+    announce(f"playing {sum(player.episodes for player in players)} episodes")
     seen = task.maze_map is None  # where there is no way over a maze to draw
     result = rollout(task, players, seed=seed, progress=False, record=True, record_observations=seen)
     return result, main, SINGLE

@@ -19,7 +19,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from datamodules.trajectories import Trajectories
-from dds_lightning.interpret.atlas.pictures import Picture, Studio, Tell
+from dds_lightning.interpret.atlas.pictures import Picture, AtlasPictures, Announce
 from dds_lightning.interpret.draw import charts
 from dds_lightning.interpret.measure import statistics
 from dds_lightning.interpret.measure.comparison import compare_recovery
@@ -106,7 +106,7 @@ def make_atlas(
     states: int = STATES,
     segments: int = 20_000,
     seed: int = 0,
-    tell: Tell = lambda words: None,
+    announce: Announce = lambda message: None,
 ) -> Atlas:
     """Measure and draw everything.
 
@@ -121,13 +121,13 @@ def make_atlas(
         states: from which every code is replayed to be recovered, and segments for each code's round trip.
         segments: of the data that are encoded, about.
         seed: of every draw.
-        tell: told what is being done.
+        announce: told what is being done.
 
     Raises:
         UserError: model and data do not fit.
     """
     skill = agent.skill
-    tell("encoding the data")
+    announce("encoding the data")
     coded = statistics.code_segments(skill, trajectories, segments, seed)
     table = statistics.skill_table(task, coded, agent.policy)
     used = np.flatnonzero(coded.share >= RARE / skill.num_skills)
@@ -135,13 +135,13 @@ def make_atlas(
     table["nearest"] = statistics.nearest_codes(distances)
     table["near"] = distances[np.arange(len(distances)), table["nearest"]]
     if not has_state(task):
-        tell("playing skills at random: the data do not hold the simulator's state")
+        announce("playing skills at random: the data do not hold the simulator's state")
     stage = trajectories if has_state(task) else play_skills(task, skill, seed=seed)
     drawn = draw_states(task, stage, states, seed)
     spread = statistics.decoder_diversity(skill, drawn.observations, noise_scale=agent.noise_scale, seed=seed)
     table[["spread", "apart"]] = spread[["spread", "apart"]]
     with simulator(task) as env:
-        tell("telling codes from behaviour")
+        announce("telling codes from behaviour")
         trip = round_trip(task, skill, stage, states, agent.noise_scale, seed, env)
         recovery, _ = code_recovery(task, skill, drawn, used, agent.noise_scale, seed, env)
         for name, codes, shares in (
@@ -151,22 +151,22 @@ def make_atlas(
             table[name] = pd.Series(shares, index=codes).reindex(table["code"]).to_numpy()
         if singles is not None and result is not None:
             table = table.join(_alone(task, result, singles), on="code")
-        studio = Studio(task, agent, env, seed, tell)
-        studio.skills(table, used, drawn.take(np.arange(min(STARTS, len(drawn)))))
+        drawings = AtlasPictures(task, agent, env, seed, announce)
+        drawings.skills(table, used, drawn.take(np.arange(min(STARTS, len(drawn)))))
         if result is not None and main is not None:
-            studio.episodes(result, main)
-        studio.values()
-    tell("drawing")
+            drawings.episodes(result, main)
+        drawings.values()
+    announce("drawing")
     transitions = statistics.transition_matrix(coded)
-    studio.diversity(table)
-    studio.matrices(trip, recovery, transitions, distances, coded)
+    drawings.diversity(table)
+    drawings.matrices(trip, recovery, transitions, distances, coded)
     comparison = None
     if others:
         rows = [(DISCRETE, skill), *others]
         comparison = compare_recovery(
-            task, stage, rows, skill.num_skills, states, seed, lambda name: tell(f"comparing: {name}")
+            task, stage, rows, skill.num_skills, states, seed, lambda name: announce(f"comparing: {name}")
         )
-        studio.keep(
+        drawings.keep(
             "comparison",
             charts.plot_comparison(comparison),
             "A dot is a model, a bar the mean of those of one name. Continuous skills were put into "
@@ -183,8 +183,8 @@ def make_atlas(
         distances=distances,
         comparison=comparison,
         segments=len(coded.codes),
-        pictures=studio.pictures,
-        clips=studio.clips,
+        pictures=drawings.pictures,
+        clips=drawings.clips,
     )
 
 

@@ -31,7 +31,7 @@ DPI = 130
 STROBES = 4
 """Skills in a stroboscopic picture."""
 
-Tell = Callable[[str], None]
+Announce = Callable[[str], None]
 """Told in words what is being done."""
 
 
@@ -88,11 +88,11 @@ def most_different(paths: NDArray[Any], share: NDArray[Any], count: int = STROBE
     return best[1], np.sort(best[2])
 
 
-class Studio:
+class AtlasPictures:
     """Makes the pictures of an atlas."""
 
-    def __init__(self, task: Task, agent: DDSAgent, env: Any, seed: int, tell: Tell) -> None:
-        self.task, self.agent, self.env, self.seed, self.tell = task, agent, env, seed, tell
+    def __init__(self, task: Task, agent: DDSAgent, env: Any, seed: int, announce: Announce) -> None:
+        self.task, self.agent, self.env, self.seed, self.announce = task, agent, env, seed, announce
         self.pictures: dict[str, Picture] = {}
         self.clips: dict[int, Picture] = {}
         whole = max(round(view_of(task).held / task.step_seconds / agent.horizon), 1)
@@ -112,13 +112,13 @@ class Studio:
     def skills(self, table: pd.DataFrame, used: NDArray[Any], drawn: BodyStates) -> None:
         """What each skill does: trajectories or movement, and a clip of each."""
         task, seconds = self.task, self.steps * self.task.step_seconds
-        self.tell("replaying the skills")
+        self.announce("replaying the skills")
         maze_like = task.maze_map is not None
         states = rest_states(task, junctions(task)) if maze_like else drawn
         made = replay_codes(
             task, self.agent.skill, states, used, self.steps, self.agent.noise_scale, self.seed, self.env
         )
-        self.tell("drawing the skills")
+        self.announce("drawing the skills")
         if maze_like:
             positions = made.qpos[..., :2]
             for code in used:
@@ -166,7 +166,7 @@ class Studio:
             for code, body in bodies.items():
                 words = f"Clip: the body under skill {code} for {self.steps * self.task.step_seconds:g} seconds."
                 self._clip(code, strobe.body_clip(self.task, body, code), words)
-        self.tell("rendering, if a graphics driver is there")
+        self.announce("rendering, if a graphics driver is there")
         some = np.arange(0, self.steps + 1, every)
         series = own.take(np.isin(own.codes, chosen))
         rendered = render_frames(self.task, np.concatenate(series.qpos[:, some]))
@@ -182,7 +182,7 @@ class Studio:
 
     def episodes(self, result: RolloutResult, main: str) -> None:
         """How the policy strings skills together."""
-        self.tell("drawing episodes")
+        self.announce("drawing episodes")
         figure = stitching.plot_stitching(self.task, result, main)
         self.keep(
             "stitching",
@@ -203,7 +203,7 @@ class Studio:
         """V and the policy over a maze."""
         if self.task.maze_map is None or self.agent.policy is None:
             return
-        self.tell("mapping values")
+        self.announce("mapping values")
         self.keep(
             "values",
             values.plot_policy_map(self.task, self.agent, self.steps, self.seed, self.env),

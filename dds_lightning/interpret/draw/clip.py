@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from dds_lightning.interpret.draw.drawing import draw_starts, draw_walls, extent
-from dds_lightning.interpret.draw.gif import Still, gif_bytes
+from dds_lightning.interpret.draw.gif import CachedBackground, gif_bytes
 from dds_lightning.interpret.draw.palette import ink, skill_colour
 from dds_lightning.rollout.result import RolloutPath
 from dds_lightning.saving.files import written_whole
@@ -47,7 +47,7 @@ def write_clip(
     ax.add_collection(trail)
     (body,) = ax.plot([], [], "o", markersize=13, markeredgecolor="black", markeredgewidth=0.8, zorder=6)
     number = ax.text(0.0, 0.0, "", fontsize=7.5, ha="center", va="center", zorder=7)
-    still = Still(figure, (trail, body, number, caption))
+    background = CachedBackground(figure, (trail, body, number, caption))
 
     pieces = np.stack([positions[:-1], positions[1:]], axis=1)  # (T, 2, 2)
     colours = [skill_colour(int(code)) for code in codes]
@@ -62,7 +62,7 @@ def write_clip(
         number.set_position((float(positions[t][0]), float(positions[t][1])))
         number.set(text=str(code) if code >= 0 else "", color=ink(colour))
         caption.set_text((f"skill {code:2d}   " if code >= 0 else "") + f"step {t:3d}")
-        images.append(still.frame())
+        images.append(background.frame())
     path = Path(path)
     with written_whole(path) as part:
         part.write_bytes(gif_bytes(images, fps))
@@ -99,11 +99,11 @@ def replay_clip(
     ax.add_collection(trails)
     (bodies,) = ax.plot([], [], "o", color=skill_colour(code), markersize=5, markeredgecolor="black", zorder=6)
     caption = figure.text(0.03, 1 - 0.08 / tall, "", fontsize=8.5, va="top")
-    still = Still(figure, (trails, bodies, caption))
+    background = CachedBackground(figure, (trails, bodies, caption))
     pictures = []
     for t in shown:
         trails.set_segments(list(positions[:, : t + 1]))
         bodies.set_data(*positions[:, t].T)
         caption.set_text(f"skill {code}   {t * task.step_seconds:4.2f} s")
-        pictures.append(still.frame())
+        pictures.append(background.frame())
     return gif_bytes(pictures, fps, colours=64)

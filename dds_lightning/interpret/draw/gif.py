@@ -20,7 +20,7 @@ LAST = 1500
 """Milliseconds that the last frame stays, to see the end."""
 
 
-class Still:
+class CachedBackground:
     """A drawn figure in which a few things move: the rest is drawn once, which is what makes a clip fast.
 
     Args:

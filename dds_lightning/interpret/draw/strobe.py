@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dds_lightning.errors import UserError
 from dds_lightning.interpret.draw.drawing import LABEL, TICKS, draw_walls, grid, heading
-from dds_lightning.interpret.draw.gif import Still, gif_bytes
+from dds_lightning.interpret.draw.gif import CachedBackground, gif_bytes
 from dds_lightning.interpret.draw.palette import NO_SKILL, WALL, skill_colour
 from dds_lightning.interpret.measure.body import BodyFrames
 from dds_lightning.interpret.views import View, view_of
@@ -124,7 +124,7 @@ def body_clip(
     (joints,) = ax.plot([], [], ".", color="black", markersize=3, zorder=4)
     (things,) = ax.plot([], [], "s", color=NO_SKILL, markersize=4, zorder=2)
     caption = figure.text(0.03, 1 - 0.08 / tall, "", fontsize=8.5, va="top")
-    still = Still(figure, (marks, limbs, joints, things, caption))
+    background = CachedBackground(figure, (marks, limbs, joints, things, caption))
     pictures = []
     for t in shown:
         offset = np.array([body.root[t, view.axes[0]], 0.0]) if follows else np.zeros(2)
@@ -136,7 +136,7 @@ def body_clip(
             places = np.arange(np.ceil((left + offset[0]) * 2) / 2, right + offset[0], 0.5) - offset[0]
             marks.set_segments([[(x, 0.0), (x, -0.07)] for x in places])
         caption.set_text(f"skill {code}   {t * seconds:4.2f} s   {_travel(view, body, t)}")
-        pictures.append(still.frame())
+        pictures.append(background.frame())
     return gif_bytes(pictures, fps, colours=64)
 
 

@@ -67,11 +67,11 @@ def maze():
     players = [Contestant("policy", agent.variant("sample"), 2), single_skills(agent, 2)]
     result = rollout(short, players, workers=0, progress=False, record=True)
     others = [("continuous skills, clustered", tiny_skill(MAZE, bottleneck="gaussian"))]
-    told: list[str] = []
+    messages: list[str] = []
     made = make_atlas(
-        agent, MAZE, recorded(MAZE, 100), result, "policy", "single skill", others, states=3, tell=told.append
+        agent, MAZE, recorded(MAZE, 100), result, "policy", "single skill", others, states=3, announce=messages.append
     )
-    assert "replaying the skills" in told
+    assert "replaying the skills" in messages
     return made
 
 
