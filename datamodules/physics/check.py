@@ -241,7 +241,7 @@ def replay_check(spec: str, task: Task | str, steps: int = 200, seed: int = 0) -
         spec: As in `load_trajectories`.
         task: The task that the data should fit.
         steps: How many; fewer where the recording is shorter.
-        seed: Of their draw.
+        seed: Seed of their draw.
 
     Raises:
         UserError: For an unknown source or task, or steps below 1.

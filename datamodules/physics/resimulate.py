@@ -21,7 +21,7 @@ def simulate(inner: Any, recorded: RecordedSteps, noise: _Noise | None = None) -
 
     Args:
         inner: The environment without wrappers, after a reset.
-        recorded: n steps.
+        recorded: N steps.
         noise: Moves the states; None leaves them.
 
     Returns:

@@ -70,7 +70,7 @@ def draw_steps(spec: str, task: Task, count: int, seed: int = 0) -> RecordedStep
         spec: As in `load_trajectories`.
         task: From `resolve_task`, whose observations and actions the recording has.
         count: Steps to draw; fewer come back where the recording is shorter.
-        seed: Of the draw.
+        seed: Seed of the draw.
 
     Raises:
         UserError: For a count below 1.

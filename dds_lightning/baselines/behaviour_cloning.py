@@ -108,7 +108,7 @@ class CloneActor:
     """A clone as an `Actor`: no skills, no noise, no memory.
 
     Args:
-        module: the trained policy; it is put in evaluation mode and used where it is.
+        module: The trained policy; it is put in evaluation mode and used where it is.
     """
 
     def __init__(self, module: BehaviourCloning) -> None:
@@ -119,7 +119,7 @@ class CloneActor:
         """The actor of a checkpoint that `fit_clone` wrote.
 
         Raises:
-            UserError: no such file, unreadable, or of another kind of model.
+            UserError: No such file, unreadable, or of another kind of model.
         """
         return cls(BehaviourCloning.load(path))
 
@@ -156,7 +156,7 @@ def fit_clone(
         task: The task that the data belong to.
         data: As `SegmentDataModule` takes it, for example `local:DIR`.
         directory: Where logs and checkpoint go.
-        seed: Of the weights, the split and the order of batches.
+        seed: Seed of the weights, the split and the order of batches.
         steps: Optimiser steps.
         batch_size: Single steps of the data in a batch.
         lr: Learning rate at the start.

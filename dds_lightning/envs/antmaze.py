@@ -157,7 +157,7 @@ class D4RLAntMazeEnv(MujocoEnv, EzPickle):
         """Start an episode.
 
         Args:
-            seed: Of goal and pose.
+            seed: Seed of goal and pose.
             options: Any of `reset_cell` (row, column) in place of the start cell, `goal` (2,) metres in place
                 of a drawn one, and `noise`: False puts the ant in the model's pose, at rest.
 

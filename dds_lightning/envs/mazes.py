@@ -23,12 +23,12 @@ class AntMaze(NamedTuple):
     """One AntMaze in D4RL's physics.
 
     Attributes:
-        maze_map: rows of the maze, "1" wall and "0" free.
-        cap: steps of an evaluation episode.
+        maze_map: Rows of the maze, "1" wall and "0" free.
+        cap: Steps of an evaluation episode.
         goal_cell: (row, column) round which goals are drawn.
         start_cell: (row, column) where episodes start; the origin of the coordinates.
-        cell_size: side of a cell in metres.
-        goal_radius: distance in metres that counts as reaching the goal.
+        cell_size: Side of a cell in metres.
+        goal_radius: Distance in metres that counts as reaching the goal.
     """
 
     maze_map: tuple[str, ...]

@@ -122,13 +122,13 @@ class EnvPool:
     number of workers.
 
     Args:
-        task: what to build; must be picklable when there are workers.
-        num_envs: slots E.
-        workers: processes; None one a core, 0 steps in the calling process.
+        task: The task to build; must be picklable if there are workers.
+        num_envs: Slots E.
+        workers: Number of processes; None starts one per core, 0 steps in the calling process.
 
     Raises:
         UserError: `num_envs` or `workers` out of range.
-        EnvPoolError: an environment could not be built.
+        EnvPoolError: An environment could not be built.
     """
 
     def __init__(self, task: Task, num_envs: int, workers: int | None = None) -> None:
@@ -169,7 +169,7 @@ class EnvPool:
         """Begin the first episode of every slot; a rollout in progress is abandoned.
 
         Args:
-            seeds: for each slot the seeds of its episodes; an empty or missing list leaves it idle.
+            seeds: For each slot the seeds of its episodes; an empty or missing list leaves it idle.
 
         Returns:
             (E,) records, see `record_dtype`; only `observation`, `position` and `alive` are filled.

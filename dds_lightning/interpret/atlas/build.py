@@ -19,7 +19,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from datamodules.trajectories import Trajectories
-from dds_lightning.interpret.atlas.pictures import Picture, AtlasPictures, Announce
+from dds_lightning.interpret.atlas.pictures import Announce, AtlasPictures, Picture
 from dds_lightning.interpret.draw import charts
 from dds_lightning.interpret.measure import statistics
 from dds_lightning.interpret.measure.comparison import compare_recovery
@@ -47,20 +47,20 @@ class Atlas:
     """What is known of a checkpoint's skills.
 
     Attributes:
-        task: where they were replayed.
+        task: The task in which they were replayed.
         horizon: H.
-        table: a row a code: `statistics.skill_table` with `spread` and `apart` (`decoder_diversity`), `nearest` and
+        table: A row a code: `statistics.skill_table` with `spread` and `apart` (`decoder_diversity`), `nearest` and
             `near` (code and its distance in the codebook), `again` and `recovered` (shares of the round trip's and of
             the recovery's replays; NaN for codes out of use), and, where they played alone, `alone` (per cent that
             succeed, else the normalised score) and `alone_episodes`.
-        trip: codes told from behaviour in states where the data use them.
-        recovery: the same from any state, of the codes in use.
+        trip: Codes told from behaviour in states where the data use them.
+        recovery: The same from any state, of the codes in use.
         transitions: (K, K), see `statistics.transition_matrix`.
         distances: (K, K), see `statistics.code_distances`.
-        comparison: of `recovery.compare_recovery`, if there were other models.
-        segments: number of segments of the data that were encoded.
-        pictures: of the page, by name.
-        clips: code to its clip.
+        comparison: Table from `recovery.compare_recovery`, if there were other models.
+        segments: Number of segments of the data that were encoded.
+        pictures: Pictures of the page, by name.
+        clips: The clip of each code.
     """
 
     task: Task
@@ -111,20 +111,20 @@ def make_atlas(
     """Measure and draw everything.
 
     Args:
-        agent: the skills; its policy too, if it has one.
-        task: where they are replayed.
-        trajectories: the data of that task.
-        result: episodes of the policy and of single skills, with paths; without it they are left out.
-        main: the contestant of `result` whose episodes are shown.
-        singles: the contestant of `result` whose parts are single skills.
-        others: names and models to compare with, see `recovery.compare_recovery`.
-        states: from which every code is replayed to be recovered, and segments for each code's round trip.
-        segments: of the data that are encoded, about.
-        seed: of every draw.
-        announce: told what is being done.
+        agent: The skills; its policy too, if it has one.
+        task: The task in which they are replayed.
+        trajectories: The data of that task.
+        result: Episodes of the policy and of single skills, with paths; without it they are left out.
+        main: The contestant of `result` whose episodes are shown.
+        singles: The contestant of `result` whose parts are single skills.
+        others: Names and models to compare with, see `recovery.compare_recovery`.
+        states: From which every code is replayed to be recovered, and segments for each code's round trip.
+        segments: Approximate number of segments of the data to encode.
+        seed: Seed of every draw.
+        announce: Called with a message before each step.
 
     Raises:
-        UserError: model and data do not fit.
+        UserError: Model and data do not fit.
     """
     skill = agent.skill
     announce("encoding the data")

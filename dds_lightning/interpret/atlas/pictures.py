@@ -40,12 +40,12 @@ class Picture:
     """A picture of the page.
 
     Attributes:
-        name: of its place in the page, a word.
-        caption: what a reader should know of it.
-        alt: what it shows, for whoever cannot see it.
+        name: Key of its place in the page.
+        caption: What a reader should know about it.
+        alt: Alternative text for people who cannot see it.
         data: PNG or GIF.
-        size: width and height in pixels.
-        mime: of `data`.
+        size: Width and height in pixels.
+        mime: Of `data`.
     """
 
     name: str
@@ -66,7 +66,7 @@ def most_different(paths: NDArray[Any], share: NDArray[Any], count: int = STROBE
     Args:
         paths: (C, S, T + 1, P) positions under C codes from S states; NaN after a replay's end.
         share: (C,) of the data.
-        count: how many codes; C at most.
+        count: How many codes; C at most.
 
     Returns:
         The state's number, and the codes' rows, in their order.

@@ -17,7 +17,7 @@ def plot_scores(summary: pd.DataFrame) -> Figure:
     """Normalised score of every contestant and of every single skill, with its standard error.
 
     Args:
-        summary: columns `contestant`, `kind` ("skill" for a single skill's row), `score`, `score_error`.
+        summary: Columns `contestant`, `kind` ("skill" for a single skill's row), `score`, `score_error`.
     """
     rows = summary.iloc[::-1]  # bars are drawn from below
     names = [textwrap.fill(str(name), WRAP) for name in rows["contestant"]]

@@ -62,13 +62,13 @@ def plot_matrix(
     Args:
         matrix: (C, C); NaN is left white.
         codes: (C,) of rows and columns.
-        xlabel: what the columns are.
-        ylabel: what the rows are.
-        title: of the figure.
-        form: of the numbers, times `factor`.
+        xlabel: Label of the columns.
+        ylabel: Label of the rows.
+        title: Title of the figure.
+        form: Format of the numbers, which are multiplied by `factor`.
         factor: 100 for shares in per cent.
-        hide: numbers (times `factor`) below this are not written.
-        unit: of the colour bar.
+        hide: Numbers (times `factor`) below this are not written.
+        unit: Unit of the colour bar.
     """
     size = len(matrix)
     side = float(np.clip(0.36 * size + 1.4, 3.4, 7.0))
@@ -130,8 +130,8 @@ def plot_effects(task: Task, found: Recovery) -> Figure:
     """What each code does to the displacement, a dot a state and the code's number at its mean.
 
     Args:
-        task: where it was measured.
-        found: of `recovery.code_recovery`.
+        task: The task in which it was measured.
+        found: Result of `recovery.code_recovery`.
     """
     names = view_of(task).path
     across, up = 0, len(names) - 1
@@ -158,7 +158,7 @@ def plot_diversity(table: pd.DataFrame) -> Figure:
     """How much noise alone changes an action, and how much the code does, one bar and one mark a code.
 
     Args:
-        table: of `statistics.decoder_diversity`, or any with its columns.
+        table: Table from `statistics.decoder_diversity`, or any with its columns.
     """
     figure = Figure(figsize=(7.0, 2.6), layout="constrained")
     ax = figure.add_subplot()
@@ -191,8 +191,8 @@ def plot_where(task: Task | None, segments: CodedSegments) -> Figure:
     all others, along the two numbers of an observation by which codes are told apart best.
 
     Args:
-        task: what the data are of.
-        segments: of `statistics.code_segments`.
+        task: The task of the data.
+        segments: Segments from `statistics.code_segments`.
     """
     if task is not None and task.maze_map is not None:
         return _where_in_maze(task, segments)
@@ -251,7 +251,7 @@ def plot_comparison(table: pd.DataFrame) -> Figure:
     """Recovery, information and decoding error of several models, a dot a seed, the mean as a bar.
 
     Args:
-        table: of `recovery.compare_recovery`.
+        table: Table from `recovery.compare_recovery`.
     """
     names = list(dict.fromkeys(table["model"]))
     figure = Figure(figsize=(7.0, 2 * (0.5 * len(names) + 1.25)), layout="constrained")

@@ -26,12 +26,12 @@ def write_clip(
     """Write an episode as an animated GIF: the walls, the body, its trail coloured by the skill in use.
 
     Args:
-        path: the file to write.
-        task: the maze.
-        episode: the path to show.
-        title: one line above the maze.
-        frames: at most this many frames; the episode is thinned to fit.
-        fps: frames a second.
+        path: The file to write.
+        task: The maze.
+        episode: The path to show.
+        title: One line above the maze.
+        frames: At most this many frames; the episode is thinned to fit.
+        fps: Frames per second.
     """
     positions, codes = np.asarray(episode.positions), np.asarray(episode.codes)
     shown = np.unique(np.linspace(1, len(codes), min(frames, len(codes))).round().astype(int))
@@ -75,12 +75,12 @@ def replay_clip(
     """One skill from several starts of a maze at once, as an animated GIF.
 
     Args:
-        task: the maze.
+        task: The maze.
         positions: (N, T + 1, 2) metres; a replay that has ended (NaN) stays where it was.
-        code: of the skill; gives the colour.
-        frames: at most this many pictures.
-        fps: pictures a second.
-        size: width in inches at 80 dots an inch.
+        code: The skill's code, which determines the colour.
+        frames: Maximum number of frames.
+        fps: Frames per second.
+        size: Width in inches at 80 dots per inch.
     """
     positions = np.asarray(positions, dtype=float)
     known = np.isfinite(positions[..., 0])

@@ -37,8 +37,8 @@ def plot_dataset(trajectories: Trajectories, task: Task | None = None) -> Figure
     """Draw what is in a data set.
 
     Args:
-        trajectories: the data; as they are, so load them with the task to see its rewards.
-        task: adds the score to the returns, names to the actions and, for mazes, a map of the visited places;
+        trajectories: The data; as they are, so load them with the task to see its rewards.
+        task: Adds the score to the returns, names to the actions and, for mazes, a map of the visited places;
             in the kitchen returns give way to the subtasks that were done.
     """
     if task is not None and task.maze_map is not None:

@@ -33,7 +33,7 @@ def draw_walls(ax: Axes, task: Task, goal: bool = True) -> None:
     That is a circle, or, where every episode draws its goal, all the circles there can be.
 
     Raises:
-        UserError: the task has no maze.
+        UserError: The task has no maze.
     """
     if task.maze_map is None:
         raise UserError(f"task '{task.name}' has no maze to draw; use the table of its report instead")
@@ -89,10 +89,10 @@ def draw_path(ax: Axes, path: RolloutPath, linewidth: float = 1.0, numbers: floa
     """Draw one path coloured by the skill in use.
 
     Args:
-        ax: a maze.
-        path: positions and codes.
-        linewidth: in points.
-        numbers: write each code where it takes over if that is this far (metres) from every other; 0 for none.
+        ax: Axes that show a maze.
+        path: Positions and codes.
+        linewidth: Line width in points.
+        numbers: Write each code where it takes over if that is this far (metres) from every other; 0 for none.
     """
     positions, codes = np.asarray(path.positions), np.asarray(path.codes)
     pieces = np.stack([positions[:-1], positions[1:]], axis=1)  # (T, 2, 2)

@@ -24,8 +24,8 @@ class CachedBackground:
     """A drawn figure in which a few things move: the rest is drawn once, which is what makes a clip fast.
 
     Args:
-        figure: with everything in place.
-        moving: the artists that change from frame to frame.
+        figure: The figure with everything in place.
+        moving: The artists that change from frame to frame.
     """
 
     def __init__(self, figure: Figure, moving: Sequence[Any]) -> None:
@@ -50,9 +50,9 @@ def gif_bytes(frames: Sequence[NDArray[np.uint8]], fps: int = 15, colours: int =
     """Encode pictures (h, w, 3) as a GIF that repeats for ever.
 
     Args:
-        frames: at least one.
-        fps: frames a second.
-        colours: of the one table that all frames share.
+        frames: At least one.
+        fps: Frames per second.
+        colours: Size of the colour table, which all frames share.
     """
     images = [Image.fromarray(frame) for frame in frames]
     # The last picture has nearly every colour of the others; of the rest the nearest is near enough.

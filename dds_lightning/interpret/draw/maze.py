@@ -44,7 +44,7 @@ def _rows_of(result: RolloutResult, actor: str) -> Any:
     """The rows of one contestant.
 
     Raises:
-        UserError: no such contestant.
+        UserError: The result has no such contestant.
     """
     table = result.episodes[result.episodes["actor"] == actor]
     if table.empty:
@@ -57,7 +57,7 @@ def _paths_of(result: RolloutResult, actor: str) -> list[tuple[Any, RolloutPath]
     """Rows of the table with their paths.
 
     Raises:
-        UserError: no such contestant, or nothing was recorded of it.
+        UserError: The result has no such contestant, or nothing was recorded for it.
     """
     rows = [
         (row, result.paths[actor, int(row.episode)])
@@ -97,14 +97,14 @@ def plot_trajectories(task: Task, result: RolloutResult, actor: str, episodes: i
     """Episodes of one contestant over the maze, coloured by the skill in use (the paper's AntMaze figure, d and h).
 
     Args:
-        task: the maze.
-        result: table and paths.
-        actor: the contestant.
-        episodes: how many paths to draw; successful ones first.
-        numbered: on how many of them the codes are written.
+        task: The maze.
+        result: Table and paths.
+        actor: The contestant.
+        episodes: How many paths to draw; successful ones first.
+        numbered: On how many of them the codes are written.
 
     Raises:
-        UserError: no such contestant, or no recorded paths of it.
+        UserError: The result has no such contestant, or no paths of it were recorded.
     """
     rows = sorted(_paths_of(result, actor), key=lambda row: not row[0].success)[:episodes]
     figure, ax = maze_figure(task)
@@ -124,13 +124,13 @@ def plot_single_skills(task: Task, result: RolloutResult, actor: str = "single s
     """Each skill alone in the task itself, one panel a skill.
 
     Args:
-        task: the maze.
-        result: table and paths; every episode of the contestant keeps to one skill.
-        actor: the contestant whose every part is one skill.
-        steps: how much of each replay to draw; later ones only pile up against a wall.
+        task: The maze.
+        result: Table and paths; every episode of the contestant keeps to one skill.
+        actor: The contestant whose every part is one skill.
+        steps: How much of each replay to draw; later ones only pile up against a wall.
 
     Raises:
-        UserError: no such contestant, or no recorded paths of it.
+        UserError: The result has no such contestant, or no paths of it were recorded.
     """
     groups: dict[int, list[tuple[Any, RolloutPath]]] = {}
     for row, path in _paths_of(result, actor):
@@ -157,7 +157,7 @@ def plot_starts_by_skill(
     """Each skill from several starts, one panel a skill (the paper's AntMaze figure, a to c).
 
     Args:
-        task: the maze.
+        task: The maze.
         starts: (N, 2) metres, where each replay was put.
         positions: (N, T + 1, 2) metres.
         codes: (N,) the skill of each replay.
@@ -191,12 +191,12 @@ def plot_skills_by_start(
     A skill's number is where its replay ends, or leaves the panel.
 
     Args:
-        task: the maze.
+        task: The maze.
         starts: (N, 2) metres, where each replay was put; equal rows share a panel.
         positions: (N, T + 1, 2) metres.
         codes: (N,) the skill of each replay.
         alive: (N, T) False after a replay's end; all True without it.
-        reach: half a side of the window in metres; without it two cells and a half.
+        reach: Half a side of the window in metres; without it two cells and a half.
     """
     places, panel = np.unique(np.asarray(starts), axis=0, return_inverse=True)
     figure, axes = grid(len(places), 7.0 / 3, 2.4, columns=3)
@@ -240,7 +240,7 @@ def plot_failures(task: Task, result: RolloutResult, actor: str) -> Figure:
     A dot is one end, the bold number in a cell counts them.
 
     Raises:
-        UserError: no such contestant.
+        UserError: The result has no such contestant.
     """
     table = _rows_of(result, actor)
     failed = table[~table["success"].astype(bool)]

@@ -34,10 +34,10 @@ def render_frames(task: Task, qpos: NDArray[Any], width: int = 320, height: int 
     """Render a body at some moments, the camera beside its torso.
 
     Args:
-        task: the environment.
+        task: The environment.
         qpos: (T, nq); rows after the end of a replay (NaN) are left out.
-        width: pixels.
-        height: pixels.
+        width: Width in pixels.
+        height: Height in pixels.
 
     Returns:
         (T, height, width, 3), or None where no graphics driver works.
@@ -73,12 +73,12 @@ def plot_rendered(task: Task, frames: dict[int, NDArray[np.uint8]], every: int) 
     """Rendered frames side by side, a row a skill, a column a moment: some of those of `strobe.plot_strobes`.
 
     Args:
-        task: the environment.
-        frames: code to (T, h, w, 3).
-        every: steps between two frames of the rendered series.
+        task: The environment.
+        frames: Code to (T, h, w, 3).
+        every: Steps between two frames of the rendered series.
 
     Raises:
-        UserError: there is nothing to draw.
+        UserError: There is nothing to draw.
     """
     if not frames:
         raise UserError("frames is empty: there is nothing to draw")

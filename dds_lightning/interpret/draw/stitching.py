@@ -42,7 +42,7 @@ def best_episodes(result: RolloutResult, actor: str, count: int) -> list[int]:
     """Recorded episodes of a contestant worth showing: successful ones, short before long; elsewhere by score.
 
     Raises:
-        UserError: no paths of that contestant were recorded.
+        UserError: No paths of that contestant were recorded.
     """
     table = result.episodes[result.episodes["actor"] == actor]
     recorded = [int(number) for number in table["episode"] if (actor, int(number)) in result.paths]
@@ -65,13 +65,13 @@ def plot_stitching(task: Task, result: RolloutResult, actor: str, episodes: int 
     elsewhere its first 400 steps. Where none succeeded, or nothing can succeed, the best by score are shown.
 
     Args:
-        task: what was played.
-        result: table and paths, see `rollout` with ``record=True`` or ``record_observations=True``.
-        actor: the contestant.
-        episodes: rows of the timeline.
+        task: What was played.
+        result: Table and paths, see `rollout` with ``record=True`` or ``record_observations=True``.
+        actor: The contestant.
+        episodes: Rows of the timeline.
 
     Raises:
-        UserError: no paths of that contestant were recorded.
+        UserError: No paths of that contestant were recorded.
     """
     chosen = best_episodes(result, actor, episodes)
     table = result.episodes[result.episodes["actor"] == actor].set_index("episode")
@@ -109,9 +109,9 @@ def draw_timeline(ax: Axes, sequences: Sequence[NDArray[Any]], names: Sequence[s
     """Codes over time, a row each, with the number of a skill where there is room.
 
     Args:
-        ax: where.
+        ax: Axes to draw on.
         sequences: (T,) codes in use of each row.
-        names: of the rows.
+        names: Names of the rows.
     """
     longest = max(len(codes) for codes in sequences)
     for place, codes in enumerate(sequences):

@@ -45,14 +45,14 @@ def plot_strobes(
     from behind with what it can move.
 
     Args:
-        task: the environment.
-        frames: code to T + 1 frames, all from the same state; one panel each, in this order.
-        every: steps between two drawn bodies.
-        step_seconds: seconds of a step; without it the task's.
-        title: above the panels; without it what is drawn.
+        task: The environment.
+        frames: Code to T + 1 frames, all from the same state; one panel each, in this order.
+        every: Steps between two drawn bodies.
+        step_seconds: Seconds of a step; without it the task's.
+        title: Title above the panels; None describes what is drawn.
 
     Raises:
-        UserError: there is nothing to draw.
+        UserError: There is nothing to draw.
     """
     if not frames or every < 1:
         raise UserError(f"frames are of {len(frames)} skills, every is {every}: expected at least one skill and step")
@@ -96,13 +96,13 @@ def body_clip(
     """A moving stick figure as an animated GIF.
 
     Args:
-        task: the environment.
+        task: The environment.
         body: T + 1 frames.
-        code: of the skill; gives the colour.
-        frames: at most this many pictures.
-        fps: pictures a second.
-        size: width in inches at 80 dots an inch.
-        seconds: of a step; 0 takes the task's.
+        code: The skill's code, which determines the colour.
+        frames: Maximum number of frames.
+        fps: Frames per second.
+        size: Width in inches at 80 dots per inch.
+        seconds: Seconds per step; 0 takes the task's.
     """
     view, seconds = view_of(task), seconds or task.step_seconds
     shown = np.unique(np.linspace(0, len(body) - 1, min(frames, len(body))).round().astype(int))

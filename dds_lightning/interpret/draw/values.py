@@ -54,18 +54,18 @@ def value_table(task: Task, agent: DDSAgent, steps: int | None = None, seed: int
     """The critic and the policy in every free cell, for a body at rest in its middle.
 
     Args:
-        task: a maze.
-        agent: with a policy.
-        steps: that the likeliest code is held, to see where it leads; None takes H.
-        seed: of the decoder's noise.
-        env: from `replay.simulator`, if there is one already.
+        task: A maze.
+        agent: An agent with a policy.
+        steps: How many steps the likeliest code is held to see where it leads; None takes H.
+        seed: Seed of the decoder's noise.
+        env: An environment from `replay.simulator`; without it one is created.
 
     Returns:
         A row a free cell: `row`, `column`, `x`, `y` (m), `value`, `code` (the likeliest), `probability` of it, `dx` and
         `dy` (m, where it led).
 
     Raises:
-        UserError: no maze, or no policy.
+        UserError: The task has no maze, or the agent has no policy.
     """
     if agent.policy is None:
         raise UserError("the agent has no policy: there are no values and no choices to map")
@@ -111,11 +111,11 @@ def plot_value_map(
     discounted value is small; the colour bar has the values at which they change.
 
     Args:
-        task: the maze.
-        value: observations (N, O) to V (N,); position first, then the body as it starts an episode.
-        codes: observations (N, O) to codes (N,), asked at cell centres.
+        task: The maze.
+        value: Observations (N, O) to V (N,); position first, then the body as it starts an episode.
+        codes: Observations (N, O) to codes (N,), asked at cell centres.
         directions: (K, 2) mean displacement of each code in metres, for the arrows.
-        resolution: points a cell on each axis.
+        resolution: Points per cell on each axis.
         arrows: (C, 2) displacement of the chosen code from each free cell, in their order, instead of `directions`.
     """
     figure, ax = maze_figure(task)

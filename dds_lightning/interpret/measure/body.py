@@ -67,7 +67,7 @@ def body_frames(model: Any, qpos: NDArray[Any]) -> BodyFrames:
     """Work out where limbs and joints are.
 
     Args:
-        model: the simulator's model, for example ``env.unwrapped.model``.
+        model: The simulator's model, for example ``env.unwrapped.model``.
         qpos: (T, nq) positions; rows after the end of a replay (NaN) are left out.
     """
     qpos = np.asarray(qpos, dtype=np.float64)
@@ -132,8 +132,8 @@ def root_path(task: Task, model: Any, qpos: NDArray[Any]) -> Floats:
     """Where a body is while it is replayed.
 
     Args:
-        task: the environment.
-        model: its model.
+        task: The environment.
+        model: Its model.
         qpos: (N, T + 1, nq); NaN after a replay's end.
 
     Returns:
@@ -153,7 +153,7 @@ def to_body(task: Task, away: NDArray[Any], quaternions: NDArray[Any]) -> Floats
     """Displacements as the body itself sees them: an ant's ahead and to its left, any other body's as they are.
 
     Args:
-        task: whose body.
+        task: The task that defines the body.
         away: (..., 2) along x and y; of bodies that do not turn any width.
         quaternions: (..., 4) an ant's attitude, w first; anything of other bodies.
     """

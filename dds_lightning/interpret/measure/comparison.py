@@ -31,7 +31,7 @@ class ClusteredSkills:
     """Continuous skills as K codes: the nearest of K centres, in the space of encodings.
 
     Args:
-        skill: with a Gaussian bottleneck.
+        skill: A skill model with a Gaussian bottleneck.
         centres: (K, D).
     """
 
@@ -62,14 +62,14 @@ def cluster_skills(
     """Put a continuous model's skills into clusters, by k-means on the encodings of the data.
 
     Args:
-        skill: with a Gaussian bottleneck.
-        trajectories: the data.
+        skill: A skill model with a Gaussian bottleneck.
+        trajectories: The data.
         clusters: K.
-        segments: that are encoded, drawn from all.
-        seed: of the draw and of k-means.
+        segments: Number of segments that are encoded, drawn from all.
+        seed: Seed of the draw and of k-means.
 
     Raises:
-        UserError: the model's skills are discrete already, its widths are others, or the data have too few segments.
+        UserError: The model's skills are discrete already, its widths are others, or the data have too few segments.
     """
     from scipy.cluster.vq import kmeans2
 
@@ -112,10 +112,10 @@ def decoding_error(
     segment's own vector.
 
     Args:
-        skill: any of the three.
-        trajectories: the data; best such that the model was not trained on.
-        segments: that are decoded, drawn from all.
-        seed: of the draw and of the noise.
+        skill: Any of the three.
+        trajectories: The data; best such that the model was not trained on.
+        segments: Number of segments that are decoded, drawn from all.
+        seed: Seed of the draw and of the noise.
 
     Returns:
         The root mean square error of one entry of an action.
@@ -149,13 +149,13 @@ def compare_recovery(
     """The same measurement for several models, from the same states: discrete against continuous, seed by seed.
 
     Args:
-        task: the environment.
-        trajectories: the data that states are drawn from and continuous skills are put into clusters on.
-        models: name and model; models of one name are seeds of one kind.
+        task: The environment.
+        trajectories: The data that states are drawn from and continuous skills are put into clusters on.
+        models: Name and model; models of one name are seeds of one kind.
         clusters: K for continuous models; None takes that of the first discrete one.
-        states: from which every code is replayed.
-        seed: of states, noise and k-means.
-        report: told the name of each model before its turn.
+        states: From which every code is replayed.
+        seed: Seed of states, noise and k-means.
+        report: Called with the name of each model before its turn.
 
     Returns:
         A row a model: `model`, `seed` (counted within its name), `kind` ("discrete" or "continuous"), the facts of
@@ -164,7 +164,7 @@ def compare_recovery(
         which have none).
 
     Raises:
-        UserError: continuous models alone, and no `clusters`.
+        UserError: Continuous models alone, and no `clusters`.
     """
     every = list(models)
     known = clusters or next((model.num_skills for _, model in every if model.discrete), None)

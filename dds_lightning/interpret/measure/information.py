@@ -22,8 +22,8 @@ def mutual_information(codes: NDArray[Any], values: NDArray[Any], bins: int = BI
     Args:
         codes: (N,).
         values: (N, D), for example displacements.
-        bins: parts a coordinate.
-        seed: of the shuffles.
+        bins: Bins per coordinate.
+        seed: Seed of the shuffles.
     """
     values = np.atleast_2d(np.asarray(values, dtype=np.float64).T).T
     known = np.isfinite(values).all(axis=1)

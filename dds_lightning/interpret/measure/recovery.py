@@ -46,16 +46,16 @@ class Recovery:
         codes: (C,) the codes that were replayed.
         confusion: (C, C) share of the replays of code i (row) that the encoder takes for code j; what it takes for a
             code that was not replayed is missing from the row's sum.
-        accuracy: share of all replays whose code is recovered.
-        error: standard error of `accuracy`, over states.
+        accuracy: Share of all replays whose code is recovered.
+        error: Standard error of `accuracy`, over states.
         chance: 1 / C.
-        information: mutual information in bits between code and displacement, over states and codes.
-        information_in_state: the same for `effects`. Where a body's speed decides where it goes in H steps, this is the
+        information: Mutual information in bits between code and displacement, over states and codes.
+        information_in_state: The same for `effects`. Where a body's speed decides where it goes in H steps, this is the
             larger by far.
         effects: (C, S, D) metres, what each code does to the displacement from each state: the mean over the codes from
             the same state is taken off. An ant's is ahead of it and to its left, as it stands in that state.
-        most: bits that both can be at most, log2 C.
-        states: number of states that each code was replayed from.
+        most: Bits that both can be at most, log2 C.
+        states: Number of states that each code was replayed from.
         steps: H.
     """
 
@@ -90,14 +90,14 @@ def code_recovery(
     """Replay codes for H steps, encode what happened, and compare.
 
     Args:
-        task: the environment.
-        skills: a discrete skill model, or `cluster_skills` of a continuous one.
+        task: The environment.
+        skills: A discrete skill model, or `cluster_skills` of a continuous one.
         states: S states, for example of `replay.draw_states`.
         codes: (C,) those to replay, for example the codes in use; None takes all.
-        noise_scale: as in `replay.replay_codes`.
-        seed: of the decoder's noise.
-        env: from `replay.simulator`, if there is one already.
-        report: told the steps done so far.
+        noise_scale: Factor on the decoder's noise, see `replay.replay_codes`.
+        seed: Seed of the decoder's noise.
+        env: An environment from `replay.simulator`; without it one is created.
+        report: Called with the number of steps done so far.
 
     Returns:
         The result, and the C x S replays that it was measured on.
@@ -137,12 +137,12 @@ class RoundTrip:
         codes: (C,) the codes that were replayed: those that enough segments of the data have.
         confusion: (C, C) as in `Recovery`.
         by_code: (C,) share of each code's replays in which it is found again.
-        accuracy: mean of `by_code`.
-        error: its standard error, over segments.
-        control: share of the replays of another code, from the same states, that are taken for the code of the data:
+        accuracy: Mean of `by_code`.
+        error: Its standard error, over segments.
+        control: Share of the replays of another code, from the same states, that are taken for the code of the data:
             how far the state alone gives it away.
         chance: 1 / C.
-        segments: of the data, for each code.
+        segments: Number of segments of the data for each code.
     """
 
     codes: NDArray[np.int64]
@@ -172,13 +172,13 @@ def round_trip(
     """Encode segments of the data, hold the code found from each one's first state, and encode what happens then.
 
     Args:
-        task: the environment.
-        skills: as in `code_recovery`.
-        trajectories: the data.
-        segments: for each code; a code of fewer among those that are looked at is left out, the commonest never is.
-        noise_scale: as in `replay.replay_codes`.
-        seed: of the draws and of the decoder's noise.
-        env: from `replay.simulator`, if there is one already.
+        task: The environment.
+        skills: As in `code_recovery`.
+        trajectories: The data.
+        segments: For each code; a code of fewer among those that are looked at is left out, the commonest never is.
+        noise_scale: Factor on the decoder's noise, see `replay.replay_codes`.
+        seed: Seed of the draws and of the decoder's noise.
+        env: An environment from `replay.simulator`; without it one is created.
     """
     rng = np.random.default_rng(seed)
     windows = trajectories.windows(skills.horizon)

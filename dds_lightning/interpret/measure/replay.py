@@ -118,22 +118,22 @@ def replay_codes(
     """Play every code from every state.
 
     Args:
-        task: the environment.
-        skills: whose decoder plays; a model's own device is used.
+        task: The environment.
+        skills: The model whose decoder plays; it stays on its device.
         states: S states.
-        codes: those to play; None plays all.
+        codes: Codes to play; None plays all of them.
         steps: T; None the skills' horizon H.
-        noise_scale: factor on the decoder's noise; None takes the model's own.
-        seed: of the decoder's noise.
-        env: from `simulator`, to play in an environment that is there already.
+        noise_scale: Factor on the decoder's noise; None takes the model's own.
+        seed: Seed of the decoder's noise.
+        env: From `simulator`, to play in an environment that is there already.
         each: `codes` (S,) is one code a state, instead of all from all.
-        report: told the number of steps done so far, for a progress bar.
+        report: Called with the number of steps done so far, for a progress bar.
 
     Returns:
         S x K replays, code by code: replay ``i * S + j`` is the i-th code from state j.
 
     Raises:
-        UserError: a code that there is not, or no state.
+        UserError: A code does not exist, or there are no states.
     """
     chosen = np.arange(skills.num_skills) if codes is None else np.asarray(codes, dtype=np.int64)
     if not len(states) or not len(chosen) or chosen.min() < 0 or chosen.max() >= skills.num_skills:
@@ -207,7 +207,7 @@ def play_skills(task: Task, skills: Skills, steps: int = 2000, seed: int = 0) ->
         task: The environment.
         skills: Whose decoder plays.
         steps: At least so many in all.
-        seed: Of the codes and of the decoder's noise.
+        seed: Seed of the codes and of the decoder's noise.
     """
     rng, stream = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
     episodes: list[dict[str, Any]] = []

@@ -45,7 +45,7 @@ def body_states(task: Task, observations: ArrayLike, previous: ArrayLike | None 
     observations hold no velocities moves as from the previous observation, or is at rest.
 
     Args:
-        task: whose observations.
+        task: The task that defines the observations.
         observations: (S, O).
         previous: (S, O) a step earlier; NaN rows where there is none.
     """
@@ -68,10 +68,10 @@ def draw_states(task: Task, trajectories: Trajectories, count: int, seed: int = 
     """Draw states from all over a data set, none of them an episode's last.
 
     Args:
-        task: what the data are of.
-        trajectories: the data.
+        task: The task of the data.
+        trajectories: The data.
         count: S; fewer come back from shorter data.
-        seed: of the draw.
+        seed: Seed of the draw.
     """
     rng = np.random.default_rng(seed)
     steps = np.sort(rng.choice(trajectories.num_steps, min(count, trajectories.num_steps), replace=False))
@@ -104,7 +104,7 @@ def rest_states(task: Task, cells: Sequence[Cell]) -> BodyStates:
     """The body at rest in the middle of some cells of a maze, an ant upright.
 
     Raises:
-        UserError: the task has no maze.
+        UserError: The task has no maze.
     """
     return body_states(task, at_rest(task, task.cell_to_xy(list(cells))))
 

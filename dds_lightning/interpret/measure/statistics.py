@@ -36,8 +36,8 @@ class CodedSegments:
     """M segments of the data with their codes.
 
     Attributes:
-        trajectories: the episodes that they are of.
-        relabelled: the segments; `rewards` are undiscounted sums in the task's own unit.
+        trajectories: The episodes that they are of.
+        relabelled: The segments; `rewards` are undiscounted sums in the task's own unit.
         lengths: (M,) steps of each, H or fewer before a termination.
         horizon: H.
     """
@@ -82,14 +82,14 @@ def code_segments(
     """Encode a data set, one segment every H steps.
 
     Args:
-        skill: a discrete skill model.
-        trajectories: the data.
-        segments: about this many; of more data, episodes are drawn.
-        seed: of their draw.
+        skill: A discrete skill model.
+        trajectories: The data.
+        segments: About this many; of more data, episodes are drawn.
+        seed: Seed of their draw.
 
     Raises:
-        UserError: a model of other widths, or with continuous skills.
-        DataError: no episode has H steps.
+        UserError: A model of other widths, or with continuous skills.
+        DataError: No episode has H steps.
     """
     order = np.random.default_rng(seed).permutation(trajectories.num_episodes)
     enough = int(np.searchsorted(np.cumsum(trajectories.lengths[order]), segments * skill.horizon)) + 1
@@ -172,9 +172,9 @@ def skill_table(task: Task | None, segments: CodedSegments, policy: PolicyModule
     """One row a code: its share and the means of what its segments do.
 
     Args:
-        task: what the data are of; None for unnamed data.
-        segments: of `code_segments`.
-        policy: adds `value`, mean V where the code's segments begin, and `chosen`, how likely the policy chooses the
+        task: The task of the data; None for unnamed data.
+        segments: Segments from `code_segments`.
+        policy: Adds `value`, mean V where the code's segments begin, and `chosen`, how likely the policy chooses the
             code in the states of all segments.
 
     Returns:
@@ -247,11 +247,11 @@ def decoder_diversity(
     """How much noise alone changes an action, and how much the code does, in the same states.
 
     Args:
-        skill: a discrete skill model.
+        skill: A discrete skill model.
         observations: (S, O) states.
-        draws: of noise, for each state and code.
-        noise_scale: factor on the noise; None takes the model's own.
-        seed: of the noise.
+        draws: Draws of noise for each state and code.
+        noise_scale: Factor on the noise; None takes the model's own.
+        seed: Seed of the noise.
 
     Returns:
         A row a code: `code`; `spread`, the standard deviation of an action over noise; `apart`, how far the code's mean
@@ -277,7 +277,7 @@ def telling_dimensions(observations: NDArray[Any], codes: NDArray[Any], count: i
     Args:
         observations: (M, O).
         codes: (M,).
-        count: of dimensions; O at most.
+        count: Number of dimensions; O at most.
 
     Returns:
         Columns, the best first: those with the largest share of variance between codes (eta squared).
