@@ -17,8 +17,8 @@ class StepProgress(ProgressBar):
     """Count optimiser steps towards `max_steps`, across epochs.
 
     Lightning's bars count the batches of an epoch, but here a training is measured in optimiser steps. On a terminal
-    the line is redrawn a few times a second; in a log file a line is written every minute. Metrics are read only then, so
-    that a step never waits for the device.
+    the line is redrawn a few times a second; in a log file a line is written every minute. Metrics are read only
+    then, so that a step never waits for the device.
 
     Args:
         metrics: Names of the metrics to show, if they were logged; a leading `train/` is dropped.
