@@ -166,7 +166,7 @@ class D4RLAntMazeEnv(MujocoEnv, EzPickle):
         """
         options = {name: value for name, value in (options or {}).items() if value is not None}
         if unknown := set(options) - {"reset_cell", "goal", "noise"}:
-            raise UserError(f"options has '{min(unknown)}', expected only reset_cell, goal and noise: leave it out")
+            raise UserError(f"reset has no option '{min(unknown)}', expected reset_cell, goal or noise")
         super().reset(seed=seed)
         qpos, qvel = self.data.qpos.copy(), self.data.qvel.copy()
         if not options.get("noise", True):
