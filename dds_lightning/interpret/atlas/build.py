@@ -35,29 +35,29 @@ if TYPE_CHECKING:
     from dds_lightning.skill import SkillModule
 
 STATES, STARTS = 32, 8
-"""States from which codes are recovered, and among which the start of a body's pictures is chosen."""
+"""Number of states from which codes are recovered, and of those among which a body's starting state is chosen."""
 DISCRETE, CONTINUOUS = "discrete skills", "continuous skills, clustered"
-"""What models that are compared are called, by kind."""
+"""Names of the models in a comparison, by kind."""
 RARE = 0.1
-"""A code is in use when it holds this share of 1 / K of the data."""
+"""A code is in use if its share of the data is at least this fraction of 1 / K."""
 
 
 @dataclass(frozen=True, eq=False)
 class Atlas:
-    """What is known of a checkpoint's skills.
+    """Everything known about a checkpoint's skills.
 
     Attributes:
         task: The task in which they were replayed.
         horizon: H.
-        table: A row a code: `statistics.skill_table` with `spread` and `apart` (`decoder_diversity`), `nearest` and
-            `near` (code and its distance in the codebook), `again` and `recovered` (shares of the round trip's and of
-            the recovery's replays; NaN for codes out of use), and, where they played alone, `alone` (per cent that
+        table: One row per code: `statistics.skill_table` with `spread` and `apart` (`decoder_diversity`), `nearest` and
+            `near` (code and its distance in the codebook), `again` and `recovered` (shares of the round trip's and
+            of the recovery's replays; NaN for codes not in use), and, if they played alone, `alone` (per cent that
             succeed, else the normalised score) and `alone_episodes`.
-        trip: Codes told from behaviour in states where the data use them.
-        recovery: The same from any state, of the codes in use.
+        trip: How well codes are recognised from behaviour in states where the data use them.
+        recovery: The same from any state, for the codes in use.
         transitions: (K, K), see `statistics.transition_matrix`.
         distances: (K, K), see `statistics.code_distances`.
-        comparison: Table from `recovery.compare_recovery`, if there were other models.
+        comparison: Table from `recovery.compare_recovery`, if other models were given.
         segments: Number of segments of the data that were encoded.
         pictures: Pictures of the page, by name.
         clips: The clip of each code.
@@ -118,13 +118,13 @@ def make_atlas(
         main: The contestant of `result` whose episodes are shown.
         singles: The contestant of `result` whose parts are single skills.
         others: Names and models to compare with, see `recovery.compare_recovery`.
-        states: From which every code is replayed to be recovered, and segments for each code's round trip.
+        states: Number of states from which every code is replayed, and of segments for each code's round trip.
         segments: Approximate number of segments of the data to encode.
-        seed: Seed of every draw.
+        seed: Seed of all draws.
         announce: Called with a message before each step.
 
     Raises:
-        UserError: Model and data do not fit.
+        UserError: The model does not fit the data.
     """
     skill = agent.skill
     announce("encoding the data")
@@ -141,7 +141,7 @@ def make_atlas(
     spread = statistics.decoder_diversity(skill, drawn.observations, noise_scale=agent.noise_scale, seed=seed)
     table[["spread", "apart"]] = spread[["spread", "apart"]]
     with simulator(task) as env:
-        announce("telling codes from behaviour")
+        announce("recognising codes from behaviour")
         trip = round_trip(task, skill, stage, states, agent.noise_scale, seed, env)
         recovery, _ = code_recovery(task, skill, drawn, used, agent.noise_scale, seed, env)
         for name, codes, shares in (
@@ -169,7 +169,7 @@ def make_atlas(
         drawings.keep(
             "comparison",
             charts.plot_comparison(comparison),
-            "A dot is a model, a bar the mean of those of one name. Continuous skills were put into "
+            "A dot is a model, a bar the mean of the models of one name. Continuous skills were grouped into "
             f"{skill.num_skills} clusters, whose centres were replayed.",
             "Bars of round trip, recovery and information of each model, with control, chance and limit marked.",
         )
@@ -189,7 +189,7 @@ def make_atlas(
 
 
 def _alone(task: Task, result: RolloutResult, singles: str) -> pd.DataFrame:
-    """How each skill does by itself, indexed by code."""
+    """Return how well each skill does by itself, indexed by code."""
     played = result.episodes[result.episodes["actor"] == singles]
     groups = played.groupby("final_code")
     goal = task.measures_success and not task.subtasks

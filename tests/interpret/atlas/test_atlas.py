@@ -145,7 +145,7 @@ def test_the_page_tells_the_numbers_of_the_table(maze):
     rows = len(read.all("article"))
     assert rows == len(maze.clips)
     found, words = maze.recovery, " ".join(read.words.split())
-    assert f"given the same code in {100 * maze.trip.accuracy:.1f} %" in words
+    assert f"gets the same code in {100 * maze.trip.accuracy:.1f} %" in words
     assert f"recovered in {100 * found.accuracy:.1f} %" in words
     assert f"chance is {100 * found.chance:.1f} %" in words
     for share in maze.table["share"]:
