@@ -1,7 +1,7 @@
 """A short clip of an episode in a maze, drawn without any graphics driver.
 
 The walls are drawn once; every frame starts from that picture, adds what moved, and shares one colour table with the
-others. That makes it fast and the file small, which no animation writer of a library does (see `gif`).
+others. That is fast and keeps the file small, unlike the animation writers of plotting libraries (see `gif`).
 """
 
 from pathlib import Path
@@ -29,8 +29,8 @@ def write_clip(
         path: The file to write.
         task: The maze.
         episode: The path to show.
-        title: One line above the maze.
-        frames: At most this many frames; the episode is thinned to fit.
+        title: Line of text above the maze.
+        frames: Maximum number of frames; the episode is subsampled to fit.
         fps: Frames per second.
     """
     positions, codes = np.asarray(episode.positions), np.asarray(episode.codes)
@@ -72,7 +72,7 @@ def write_clip(
 def replay_clip(
     task: Task, positions: NDArray[Any], code: int, frames: int = 30, fps: int = 12, size: float = 2.9
 ) -> bytes:
-    """One skill from several starts of a maze at once, as an animated GIF.
+    """Encode one skill from several starts of a maze at once as an animated GIF.
 
     Args:
         task: The maze.
