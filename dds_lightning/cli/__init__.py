@@ -1,7 +1,7 @@
 """The command line `dds`. Nothing heavy is imported before the command is known.
 
 A function of `commands` is a command: its signature is the command line and its docstring the help. `dds STAGE`, one
-for each training stage, is Lightning's own command line (`training.stage_cli`). What a command returns is printed, as
+for each training stage, is Lightning's command line (`training.stage_cli`). What a command returns is printed, as
 text for people or, with `--json`, as a single JSON document on standard output; progress and logs go to standard error.
 """
 
@@ -133,15 +133,15 @@ def _interrupted(arguments: list[str], stop: Interrupted) -> str:
         again = [
             argument for argument in arguments if not argument.startswith("--fresh")
         ]  # --fresh would start all over
-        return f"interrupted; the same command goes on where it stopped:\n  {shlex.join(['dds', *again])}"
+        return f"interrupted; the same command continues where it stopped:\n  {shlex.join(['dds', *again])}"
     if stop.saved is None:
         same = shlex.join(["dds", *arguments])
         return f"interrupted before anything was saved; the same command begins again:\n  {same}"
     kept, skip = [], False
-    starts = ("--ckpt_path", "--model.init_from")  # a training that goes on does not start from anything
+    starts = ("--ckpt_path", "--model.init_from")  # a resumed training takes no initial weights
     for argument in arguments:
         if not skip and not argument.startswith(starts):
             kept.append(argument)
         skip = argument in starts
     command = shlex.join(["dds", *kept, "--ckpt_path", stop.saved])
-    return f"interrupted; the state is in {stop.saved}, and this goes on from it:\n  {command}"
+    return f"interrupted; the state is in {stop.saved}, and this command continues from it:\n  {command}"

@@ -29,7 +29,7 @@ def publish(
         skill: Skill checkpoint (.ckpt) instead of a run.
         policy: Policy checkpoint (.ckpt) to go with it.
         task: Name of the task to keep with it; without it the run's.
-        card: A text file for README.md; without it the run's own card.
+        card: A text file for README.md; without it the run's card.
         public: Make a new repository on the Hub public.
     """
     from dds_lightning.agent import DDSAgent

@@ -63,11 +63,11 @@ def run(
         evaluate_every: Steps between two evaluations of 10 episodes while the policy trains; the best checkpoint by
             their score is reported beside the last; 0 for none; without it a quarter of the training, on PointMaze
             none.
-        episodes: Evaluation episodes of each contestant; without it the task's own number.
+        episodes: Evaluation episodes of each contestant; without it the task's default.
         episodes_per_skill: Evaluation episodes of each single skill alone.
         selection: How the published agent chooses skills; the table shows every way.
         temperature: Temperature of `sample`; below 1 is nearer to greedy.
-        noise_scale: Factor on the decoder's noise when acting; without it the preset's, or the skill model's own.
+        noise_scale: Factor on the decoder's noise when acting; without it the preset's or the skill model's.
         workers: Number of processes for the environments; without it one per core.
         until: The last stage to do.
         fresh: Do every stage again.
@@ -160,10 +160,10 @@ def evaluate(
     Args:
         directory: A run of `dds run`, or a published checkpoint.
         task: Name of the task; without it the one the agent was made for.
-        episodes: Episodes for each way of choosing skills; without it the task's own number.
+        episodes: Episodes for each way of choosing skills; without it the task's default.
         selection: How skills are chosen: greedy, sample, argmax_q, random; several give one row each.
         temperature: Temperature of `sample`; below 1 is nearer to greedy.
-        noise_scale: Factor on the decoder's noise; without it the agent's own.
+        noise_scale: Factor on the decoder's noise; without it the agent's.
         checkpoint: Which of a run's checkpoints; both means the last and, where the run kept one, the best.
         seed: Seed of the environments and of sampling.
         workers: Number of processes for the environments; without it one per core.

@@ -99,7 +99,7 @@ def fetch(task: str, source: Literal["d4rl", "minari"] = "d4rl", out: str | None
     Args:
         task: Name of a task; `dds tasks NAME` says which data each source has for it.
         source: Either d4rl (the data behind the paper's scores) or minari.
-        out: Folder for it; without it the source's own.
+        out: Folder for it; without it the source's default folder.
     """
     from datamodules.sources.fetch import fetch as fetch_data
 

@@ -36,7 +36,7 @@ def get_task(name: str | Task) -> Task:
 
     Args:
         name: `NAME` or `NAME@VARIANT` of the table, the path of a task file, `package.module:NAME` of a `Task`, or the
-    name of a custom task that this process has read before. A `Task` is returned as it is.
+            name of a custom task that this process has read before. A `Task` is returned as it is.
 
     Raises:
         UserError: There is no such task; the message lists the nearest names.

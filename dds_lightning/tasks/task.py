@@ -66,7 +66,7 @@ class Task:
         data_start_cells: Cells where collected episodes start; None means every free cell.
         data_goal_cells: Cells that collected episodes head for; None means every free cell.
         paper_score: Normalised score that the paper reports in its table 1, if it does.
-        body: Name of the robot in `tasks.bodies`; "" takes the first word of the task's name.
+        body: Name of the robot in `tasks.bodies`; "" takes the first part of the task's name.
     """
 
     name: str
