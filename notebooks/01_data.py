@@ -35,7 +35,7 @@ from datamodules import DataError, Trajectories, check_dataset, collect_pointmaz
 from datamodules.collect.antmaze import collect_antmaze
 from dds_lightning import get_task
 from dds_lightning.interpret.draw.drawing import draw_starts, draw_trail, draw_walls
-from dds_lightning.interpret.draw.gif import Still, gif_bytes
+from dds_lightning.interpret.draw.gif import CachedBackground, gif_bytes
 from dds_lightning.interpret.draw.palette import WALL
 from dds_lightning.interpret.measure.body import body_frames
 from dds_lightning.interpret.measure.replay import simulator
@@ -151,11 +151,11 @@ ax = figure.add_subplot()
 draw_walls(ax, ant_task)
 limbs = LineCollection([], color="#2779d2", linewidth=3, capstyle="round", zorder=3)
 ax.add_collection(limbs)
-still = Still(figure, (limbs,))
+background = CachedBackground(figure, (limbs,))
 pictures = []
 for t in range(0, len(ant), 3):
     limbs.set_segments(list(ant.limbs[t][:, :, :2]))
-    pictures.append(still.frame())
+    pictures.append(background.frame())
 clip = gif_bytes(pictures, fps=10, colours=64)
 Image(data=clip, format="png")  # a GIF all the same: pages that know only "png" then play it too
 

@@ -40,7 +40,7 @@ from datamodules.relabel import relabel
 from dds_lightning import DDSAgent, get_task
 from dds_lightning.interpret.draw.charts import plot_transitions
 from dds_lightning.interpret.draw.drawing import draw_number, draw_starts, draw_walls, extent, zoom
-from dds_lightning.interpret.draw.gif import Still, gif_bytes
+from dds_lightning.interpret.draw.gif import CachedBackground, gif_bytes
 from dds_lightning.interpret.draw.palette import NO_SKILL, skill_colour
 from dds_lightning.interpret.measure.statistics import code_segments, transition_matrix
 
@@ -99,14 +99,14 @@ def recolouring() -> bytes:
         [], [], "o", markersize=3.2, color="white", markeredgecolor="black", markeredgewidth=0.6, zorder=3
     )
     caption = figure.text(0.02, 0.015, "", fontsize=10, family="monospace")
-    still = Still(figure, (trail, marks, caption))
+    background = CachedBackground(figure, (trail, marks, caption))
     pictures = []
     for done in range(len(names) + 1):
         trail.set_segments([path[cuts[i] : cuts[i + 1] + 1] for i in range(done)])
         trail.set_color([skill_colour(int(code)) for code in names[:done]])
         marks.set_data(*path[cuts[: done + 1]].T)
         caption.set_text(f"{cuts[done]:3d} of {len(path) - 1} steps, {done:2d} skills")
-        pictures.append(still.frame())
+        pictures.append(background.frame())
     return gif_bytes(pictures, fps=6)
 
 

@@ -40,7 +40,7 @@ from PIL import ImageDraw
 from dds_lightning import DDSAgent, get_task
 from dds_lightning.cli import main
 from dds_lightning.interpret.draw.drawing import draw_walls
-from dds_lightning.interpret.draw.gif import Still, gif_bytes
+from dds_lightning.interpret.draw.gif import CachedBackground, gif_bytes
 from dds_lightning.interpret.draw.maze import choose_episodes, plot_failures, plot_trajectories
 from dds_lightning.interpret.draw.palette import skill_colour
 from dds_lightning.interpret.draw.rendering import render_frames
@@ -445,7 +445,7 @@ def walk(task, body, codes, every, fps=15):
     caption = figure.text(0.02, 0.015, "", fontsize=10, family="monospace")
     trail = ax.add_collection(LineCollection([], linewidths=2))
     limbs = ax.add_collection(LineCollection([], linewidths=5, capstyle="round", zorder=6))
-    still = Still(figure, (trail, limbs, caption))
+    background = CachedBackground(figure, (trail, limbs, caption))
     colours = [skill_colour(int(code)) for code in codes]
     pieces = np.stack([body.root[:-1, :2], body.root[1:, :2]], axis=1)
     frames = []
@@ -453,7 +453,7 @@ def walk(task, body, codes, every, fps=15):
         trail.set(segments=list(pieces[:now]), color=colours[: max(now, 1)])
         limbs.set(segments=list(body.limbs[now][:, :, :2]), color=colours[now])
         caption.set_text(f"skill {codes[now]:2d}   {now * task.step_seconds:4.1f} s")
-        frames.append(still.frame())
+        frames.append(background.frame())
     return gif_bytes(frames, fps)
 
 

@@ -4,12 +4,12 @@
                 │            ▲          │            ▲
     simulated   s0 ── a0 ──► s1'        s7 ── a7 ──► s8'         error = |s' - s|, per dimension
 
-In the right physics the two differ by the rounding of stored numbers, in another one by a good part of what a step
-changes. An error is told relative to that change: the 95 % quantile of |error|, divided by the root mean square of
+In the right physics the two differ by the rounding of stored numbers, in the wrong one by a good part of what a step
+changes. An error is reported relative to that change: the 95 % quantile of |error|, divided by the root mean square of
 the change (recorded or simulated, whichever is larger). A recording fits when the worst dimension is within the limit.
 
-The kitchen's observations are noisy. There a second simulation starts from states with as much noise again, and what
-it differs by is no error; dimensions that move less than their noise are not judged.
+The kitchen's observations are noisy. There a second simulation starts from states with the same amount of noise added,
+and its difference does not count as an error; dimensions that move less than their noise are not judged.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ from dds_lightning.tasks.bodies import body_of
 from dds_lightning.tasks.env import open_env
 
 LIMIT = 0.01
-"""Relative error up to which a noiseless recording fits. Rounding to 32 bits makes 3e-5 at most; a tenth more gravity
-0.017 at least."""
+"""Relative error up to which a noiseless recording fits. Rounding to 32 bits causes at most 3e-5; 10 % more gravity
+at least 0.017."""
 
 NOISY_LIMIT = 0.1
-"""The same where observations are noisy: the right physics stays below 0.01, a tenth less speed makes 0.27 or more."""
+"""The same where observations are noisy: the right physics stays below 0.01, 10 % less speed causes 0.27 or more."""
 
 NOISE_MARGIN = 2.0
-"""Times that the effect of noise is taken off an error: one draw of it is not the largest."""
+"""How many times the effect of noise is subtracted from an error: a single draw of it is not the largest."""
 
 AT_REST = 1e-7
-"""A dimension that no step changes by more (root mean square) is not judged."""
+"""A dimension is not judged unless steps change it by more than this (root mean square)."""
 
 REWARD_TOLERANCE = 0.01
 """Rewards agree when they differ by no more than this."""
@@ -52,7 +52,7 @@ REWARD_SHARE = 0.05
 """Share of rewards that may differ, among the steps that end an episode and among the others."""
 
 CONTACTS = 2.0
-"""Relative errors above this have other reasons than contact margins, which make 1.2 at most."""
+"""Relative errors above this have other causes than contact margins, which cause at most 1.2."""
 
 MARGINS = {0.5: "halved", 2.0: "doubled"}
 """Before MuJoCo 3.5 a contact begins at the larger of two bodies' margins, since then at their sum."""
@@ -65,10 +65,10 @@ class RewardReplay:
     """How recorded rewards compare with the environment's.
 
     Attributes:
-        falls: Steps that end an episode.
-        falls_differ: How many of them have another reward.
-        others: The other steps.
-        others_differ: Likewise.
+        falls: Number of steps that end an episode.
+        falls_differ: How many of them have a different reward.
+        others: Number of other steps.
+        others_differ: How many of those have a different reward.
     """
 
     falls: int
@@ -78,11 +78,11 @@ class RewardReplay:
 
     @property
     def fit(self) -> bool:
-        """Whether few enough differ."""
+        """Whether few enough rewards differ."""
         return self.falls_differ <= REWARD_SHARE * self.falls and self.others_differ <= REWARD_SHARE * self.others
 
     def __str__(self) -> str:
-        """A line for people."""
+        """Format the comparison for people."""
         where = f"{self.others_differ} of {self.others} steps"
         if self.falls:
             where = (
@@ -98,12 +98,12 @@ class PhysicsReplay:
 
     Attributes:
         task: The variant whose environment was stepped.
-        margins: Factor on the margins of its contacts; 1 is the environment as it is.
-        dimensions: A row a dimension: `dimension` (column of the recorded observations), `name`, `change` (root
+        margins: Factor on its contact margins; 1 leaves the environment unchanged.
+        dimensions: One row per dimension: `dimension` (column of the recorded observations), `name`, `change` (root
             mean square of a step's), `error` (median), `error_95` (95 % quantile), `relative` (NaN where nothing
             moves), `judged` (whether it decides).
         limit: Largest relative error that fits.
-        rewards: None where rewards are not the environment's, but made from the data.
+        rewards: Comparison of the rewards; None if they are computed from the data, not by the environment.
     """
 
     task: Task
@@ -119,17 +119,17 @@ class PhysicsReplay:
 
     @property
     def physics_fit(self) -> bool:
-        """Whether the states that steps lead to are those recorded."""
+        """Whether steps lead to the recorded states."""
         return self.error <= self.limit
 
     @property
     def fit(self) -> bool:
-        """Whether states and rewards are."""
+        """Whether both states and rewards fit."""
         return self.physics_fit and (self.rewards is None or self.rewards.fit)
 
     @property
     def name(self) -> str:
-        """What to type to get this physics, or what was changed in it."""
+        """The task's name in this physics, with what was changed in it."""
         changed = f" with contact margins {MARGINS[self.margins]}" if self.margins != 1 else ""
         return f"{self.task.name}{changed}"
 
@@ -162,11 +162,11 @@ class ReplayReport:
 
     Attributes:
         spec: The data.
-        task: The task in the variant that the data say they are of.
-        steps: Steps that were replayed.
-        results: One for `task`, one for each other variant; where the states fit none, also those with other contact
-            margins that they fit.
-        notes: What a reader should know, a sentence each.
+        task: The task in the variant that the data claim to come from.
+        steps: Number of steps that were replayed.
+        results: One for `task`, one for each other variant; if the states fit none of these, also those with other
+            contact margins that they do fit.
+        notes: Remarks for the user, one sentence each.
     """
 
     spec: str
@@ -182,33 +182,33 @@ class ReplayReport:
 
     @cached_property
     def dimensions(self) -> pd.DataFrame:
-        """The dimensions in the task's own physics: those that decide, worst first, then the others."""
+        """The dimensions in the task's physics: those that decide, worst first, then the others."""
         table = self.results[0].dimensions
         return table.sort_values(["judged", "relative"], ascending=False, kind="stable", ignore_index=True)
 
     def table(self) -> pd.DataFrame:
-        """`dimensions` in words, without those that do not move."""
-        words = {
+        """Return `dimensions` with readable headings, without those that do not move."""
+        headings = {
             "change": "a step changes",
             "error": "error, median",
             "error_95": "error, 95 %",
             "relative": "relative",
         }
         moving = self.dimensions.dropna(subset="relative")
-        return moving[["dimension", "name", *words]].rename(columns=words)
+        return moving[["dimension", "name", *headings]].rename(columns=headings)
 
     def lines(self) -> list[str]:
-        """A verdict for every physics, the notes, and the verdict over all."""
+        """Return a verdict for every physics, the notes, and the overall verdict."""
         return [line for result in self.results for line in result.lines()] + [*self.notes, self.sentence()]
 
     def sentence(self) -> str:
         """The verdict in one sentence."""
-        own, others = self.results[0], [result for result in self.results[1:] if result.fit]
-        if own.fit:
+        first, others = self.results[0], [result for result in self.results[1:] if result.fit]
+        if first.fit:
             also = "".join(f"; {result.name} as well" for result in others)
-            return f"{self.spec} fits {self.task.name} (relative error {own.error:.2g} in {own.task.env_id}){also}"
-        if own.physics_fit:
-            reason = f"steps lead where the environment's do, but {str(own.rewards).partition(':')[0]}"
+            return f"{self.spec} fits {self.task.name} (relative error {first.error:.2g} in {first.task.env_id}){also}"
+        if first.physics_fit:
+            reason = f"steps lead to the environment's states, but {str(first.rewards).partition(':')[0]}"
         else:
             worst = self.dimensions.iloc[0]
             reason = f"{worst['name']} errs by {worst['relative']:.0%} of what a step changes"
@@ -222,7 +222,7 @@ class ReplayReport:
         return f"{self.spec} does not fit {self.task.name}: {reason}; {remedy}"
 
     def facts(self) -> dict[str, Any]:
-        """All of it for programs."""
+        """Everything for programs."""
         return {
             "steps": self.steps,
             "verdict": _verdict(self.fit),
@@ -234,18 +234,18 @@ class ReplayReport:
 def replay_check(spec: str, task: Task | str, steps: int = 200, seed: int = 0) -> ReplayReport:
     """Replay recorded steps in every physics of a task and say which of them they were recorded in.
 
-    Nothing but numbers is taken from the file; environments are those of the task table. In locomotion a quarter
-    of the steps end an episode, if so many do, because there versions of an environment pay different rewards.
+    Only numbers are read from the file; environments are those of the task table. In locomotion a quarter of the steps
+    end an episode, if there are that many, because versions of an environment pay different rewards there.
 
     Args:
         spec: As in `load_trajectories`.
         task: The task that the data should fit.
-        steps: How many; fewer where the recording is shorter.
-        seed: Of their draw.
+        steps: Number of steps; fewer if the recording is shorter.
+        seed: Seed of the draw.
 
     Raises:
-        UserError: For an unknown source or task, or steps below 1.
-        DataError: For data that are damaged or another task's, or whose steps can tell nothing.
+        UserError: The source or the task is unknown, or steps is below 1.
+        DataError: The data are damaged, belong to another task, or have no step that allows a verdict.
     """
     task = resolve_task(spec, task)
     recorded = draw_steps(spec, task, steps, seed)
@@ -255,7 +255,7 @@ def replay_check(spec: str, task: Task | str, steps: int = 200, seed: int = 0) -
         near = [result.task for result in results if result.error < CONTACTS]
         results += [result for one in near for result in _replay_margins(one, recorded)]
     if not np.isfinite(results[0].error):
-        raise DataError(f"data '{spec}': none of {steps} steps moves the body more than noise does; they tell nothing")
+        raise DataError(f"data '{spec}': none of {steps} steps moves the body more than noise does: no verdict")
     count = len(recorded.rewards)
     return ReplayReport(spec, task, count, tuple(results), recorded.notes)
 
@@ -270,16 +270,16 @@ def _replay(task: Task, recorded: RecordedSteps) -> PhysicsReplay:
 
 
 def _replay_margins(task: Task, recorded: RecordedSteps) -> Iterator[PhysicsReplay]:
-    """The physics with other contact margins that the recorded states fit."""
+    """Yield the physics with other contact margins that the recorded states fit."""
     with open_env(task) as env:
         inner: Any = env.unwrapped
         margins = inner.model.geom_margin
-        own = margins.copy()
-        touching = own[(inner.model.geom_contype | inner.model.geom_conaffinity) != 0]
-        if touching.min() == 0 or np.ptp(touching) != 0:  # only of equal ones is the sum twice the larger
+        original = margins.copy()
+        touching = original[(inner.model.geom_contype | inner.model.geom_conaffinity) != 0]
+        if touching.min() == 0 or np.ptp(touching) != 0:  # the sum is twice the larger only if all are equal
             return
         for factor in MARGINS:
-            margins[:] = factor * own
+            margins[:] = factor * original
             result = _compare(task, inner, recorded, factor)
             if result.physics_fit:
                 yield result

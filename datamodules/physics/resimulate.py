@@ -1,4 +1,4 @@
-"""Steps an environment from recorded states, and tells what noise on those states does."""
+"""Steps an environment from recorded states, and measures the effect of noise on those states."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ def simulate(inner: Any, recorded: RecordedSteps, noise: _Noise | None = None) -
 
     Args:
         inner: The environment without wrappers, after a reset.
-        recorded: n steps.
-        noise: Moves the states; None leaves them.
+        recorded: N steps.
+        noise: Noise to add to the states; None leaves them unchanged.
 
     Returns:
-        (n, W) the states reached, as a recording without noise would have them; (n,) rewards.
+        (n, W) the states reached, as a recording without noise would hold them; (n,) rewards.
     """
     robot = getattr(inner, "robot_env", None)
     reached, rewards = [], []
     for qpos, qvel, seen, actions in zip(
         recorded.qpos, recorded.qvel, recorded.observations, recorded.actions, strict=True
     ):
-        mujoco.mj_resetData(inner.model, inner.data)  # no solver's memory of the state before
+        mujoco.mj_resetData(inner.model, inner.data)  # clears what the solver remembers of the previous state
         inner.data.qpos[:], inner.data.qvel[:] = (qpos, qvel) if noise is None else noise.move(qpos, qvel)
         mujoco.mj_forward(inner.model, inner.data)
         for state, action in zip(seen, actions, strict=True):
-            if robot is not None:  # it moves from where it last saw its joints
+            if robot is not None:  # it moves from where it last observed its joints
                 robot._last_robot_qpos = state[:9].copy()
             _, reward, *_ = inner.step(action)
         reached.append(recorded.layout.observe(inner.data.qpos, inner.data.qvel))
@@ -48,12 +48,12 @@ class _Noise:
     """The kitchen's noise on recorded states.
 
     Args:
-        robot: FrankaRobot, whose configuration has the amplitudes.
-        recorded: Its objects at rest tell how much noise there is.
+        robot: The FrankaRobot, whose configuration has the amplitudes.
+        recorded: The recorded steps, whose objects at rest reveal how much noise there is.
     """
 
     def __init__(self, robot: Any, recorded: RecordedSteps) -> None:
-        # The environment reads the amplitudes of the objects' positions from one entry too early; so do we.
+        # The environment reads the amplitudes of the objects' positions one entry too early; so does this code.
         positions, velocities = robot.robot_pos_noise_amp, robot.robot_vel_noise_amp
         objects = list(recorded.layout.positions[9:])
         changes = np.nanmean((recorded.following - recorded.observations[:, -1])[:, objects] ** 2, axis=0)
@@ -65,13 +65,13 @@ class _Noise:
         self._rng = np.random.default_rng(0)
 
     def move(self, qpos: Floats, qvel: Floats) -> tuple[Floats, Floats]:
-        """A state as it would be seen."""
+        """Return a state with noise, as it would be observed."""
         a, b = (self._rng.uniform(-1.0, 1.0, len(part)) for part in (qpos, qvel))
         return qpos + a * self.positions, qvel + b * self.velocities
 
 
 def blur(inner: Any, recorded: RecordedSteps, simulated: Floats) -> tuple[Floats, Floats]:
-    """What noise does to every dimension, (W,): amplitude, and 95 % quantile of its effect on the state reached."""
+    """Return the noise of every dimension, (W,): amplitude, and 95 % quantile of its effect on the state reached."""
     if not recorded.layout.noisy:
         none = np.zeros(len(recorded.layout.names))
         return none, none

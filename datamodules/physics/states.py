@@ -5,9 +5,9 @@
 | hopper, walker2d, halfcheetah | without x, which no force depends on: 0 | all; cut to +-10 in the first two |
 | antmaze (29), pointmaze (4) | all | all |
 | kitchen, 59 as Minari stores them | all, with noise | all, with noise |
-| kitchen, 60 as D4RL stores them | all, with noise | none: differences of positions |
+| kitchen, 60 as D4RL stores them | all, with noise | not recorded: differences of positions |
 
-Where a D4RL file has `infos/qpos` and `infos/qvel` of the same rows, the state comes from there: nothing is cut.
+If a D4RL file has `infos/qpos` and `infos/qvel` for the same rows, the state is read from there: nothing is cut.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from dds_lightning.tasks import Task
 from dds_lightning.tasks.bodies import StateLayout, body_of, state_layout
 
 FALLS = 4
-"""In locomotion at most every so-manieth step ends its episode: there versions of an environment differ."""
+"""In locomotion one step in this many, at most, ends its episode: these are where versions of an environment differ."""
 
 SPARE = 8
-"""Times as many steps are read where some will not do, because velocities were cut when they were recorded."""
+"""Factor on the steps read if some may be unusable because their velocities were cut when they were recorded."""
 
 SAME = 1e-3
 """`infos` and observations of one state differ by no more than this, absolutely or relatively."""
@@ -38,18 +38,18 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class RecordedSteps:
-    """n steps of a recording; L is the layout's `lead`.
+    """Recorded steps, n of them; L is the layout's `lead`.
 
     Attributes:
-        layout: What the W columns are.
+        layout: The layout of the W columns.
         qpos: (n, nq) positions L steps before.
         qvel: (n, nv) velocities there.
         observations: (n, L + 1, W) up to the state that the step starts from.
         actions: (n, L + 1, A).
-        following: (n, W) where the step led; NaN where the file does not say.
+        following: (n, W) the state that the step led to; NaN if the file does not have it.
         rewards: (n,).
         ended: (n,) bool, whether the step terminated its episode.
-        notes: What a reader should know, a sentence each.
+        notes: Remarks for the user, one sentence each.
     """
 
     layout: StateLayout
@@ -64,20 +64,20 @@ class RecordedSteps:
 
 
 def draw_steps(spec: str, task: Task, count: int, seed: int = 0) -> RecordedSteps:
-    """Draw steps from all over a recording; in locomotion a quarter of them end an episode, if so many do.
+    """Draw steps from all over a recording; in locomotion a quarter of them end an episode, if there are that many.
 
     Args:
         spec: As in `load_trajectories`.
-        task: From `resolve_task`, whose observations and actions the recording has.
-        count: Steps to draw; fewer come back where the recording is shorter.
-        seed: Of the draw.
+        task: The task from `resolve_task`, with the recording's observations and actions.
+        count: Number of steps to draw; fewer are returned if the recording is shorter.
+        seed: Seed of the draw.
 
     Raises:
-        UserError: For a count below 1.
-        DataError: For data that are damaged or another task's, or hold no usable step.
+        UserError: The count is below 1.
+        DataError: The data are damaged, belong to another task, or hold no usable step.
     """
     if count < 1:
-        raise UserError(f"steps to replay: found {count}, expected at least 1")
+        raise UserError(f"steps to replay is {count}, expected at least 1")
     rng = np.random.default_rng(seed)
     with open_recording(spec, task, rng) as recording:
         return _draw(recording, task, count, rng)
@@ -97,14 +97,14 @@ def _draw(recording: Recording, task: Task, count: int, rng: np.random.Generator
         seen = recording.states(episode, start, step + 1 + known)[:, : len(layout.names)]
         actions, rewards = recording.taken(episode, start, step + 1)
         fell = bool(recording.ended[episode] and step == recording.steps[episode] - 1)
-        # A repeated state stands for one that nobody recorded.
+        # A repeated state stands for one that was not recorded.
         led = seen[-1] if known and not (fell and np.array_equal(*seen[-2:])) else np.full(len(layout.names), np.nan)
         rows.append((seen[: layout.lead + 1], actions, led, rewards[-1], fell))
         inner.append(recording.inner(episode, start))
     columns = [np.array(values, dtype=np.float64) for values in zip(*rows, strict=True)]
     for name, values in zip(("observations", "actions", "observations", "rewards"), columns, strict=False):
         if np.isinf(values).any() or (np.isnan(values).any() and values is not columns[2]):
-            raise DataError(f"{recording.where}, {name}: found a number that is not finite")
+            raise DataError(f"{recording.where}, {name}: expected finite numbers, got NaN or infinity")
     qpos, qvel, whole, notes = _states(layout, columns[0], inner, task.step_seconds)
     ended = columns[4] > 0
     few = [rng.permutation(np.flatnonzero(whole & kind)) for kind in (ended & falls, ~(ended & falls))]
@@ -112,7 +112,7 @@ def _draw(recording: Recording, task: Task, count: int, rng: np.random.Generator
     kept = np.sort(np.append(few[0], few[1][: count - len(few[0])]))
     if not np.isfinite(columns[2][kept]).all(axis=1).any():
         raise DataError(
-            f"{recording.where}: of {len(rows)} steps none leads from a whole recorded state to another one"
+            f"{recording.where}: none of {len(rows)} steps leads from one complete recorded state to another"
         )
     observations, actions, following, rewards = (values[kept] for values in columns[:4])
     return RecordedSteps(layout, qpos[kept], qvel[kept], observations, actions, following, rewards, ended[kept], notes)
@@ -121,39 +121,39 @@ def _draw(recording: Recording, task: Task, count: int, rng: np.random.Generator
 def _states(
     layout: StateLayout, observations: Floats, inner: list[Any], seconds: float
 ) -> tuple[Floats, Floats, NDArray[np.bool_], tuple[str, ...]]:
-    """The simulator's states at the start of every replay: qpos, qvel, whether they are whole, and notes."""
+    """Return the simulator's states at the start of every replay: qpos, qvel, whether they are complete, and notes."""
     first = observations[:, 0]
     whole: NDArray[np.bool_] = np.ones(len(first), bool)
-    if inner[0] is not None and all(_agrees(layout, own, seen) for own, seen in zip(inner, first, strict=True)):
+    if inner[0] is not None and all(_agrees(layout, state, seen) for state, seen in zip(inner, first, strict=True)):
         qpos, qvel = (np.array(part, dtype=np.float64) for part in zip(*inner, strict=True))
         return qpos, qvel, whole, ()
     qpos = np.pad(first[:, list(layout.positions)], ((0, 0), (layout.hidden, 0)))
     if layout.velocities:
         qvel = first[:, list(layout.velocities)]
         return qpos, qvel, whole & (np.abs(qvel) < layout.speed_limit).all(axis=1), ()
-    # Of the kettle's seven position numbers four are a quaternion: it is taken not to spin.
+    # Four of the kettle's seven position numbers are a quaternion: assume that it does not spin.
     rates = (observations[:, 1] - first)[:, list(layout.positions)] / seconds
     note = (
-        f"the file holds no velocities: they are estimated from positions {layout.lead} steps earlier and mostly "
-        "forgotten since, so the verdict is weaker than with velocities"
+        f"the file holds no velocities: they are estimated from positions {layout.lead} steps earlier and have "
+        "mostly decayed since, so the verdict is weaker than with velocities"
     )
     return qpos, np.pad(rates[:, :-4], ((0, 0), (0, 3))), whole, (note,)
 
 
 def _agrees(layout: StateLayout, inner: tuple[Floats, Floats], seen: Floats) -> bool:
-    """Whether the simulator's state is that of an observation; D4RL's recorders were not always in step."""
+    """Whether the simulator's state matches an observation; D4RL's recorders were not always in step."""
     if (len(inner[0]), len(inner[1])) != (layout.hidden + len(layout.positions), layout.degrees):
         return False
     recorded = [*layout.positions, *layout.velocities]
-    told = layout.observe(*inner)[recorded]
-    near = np.abs(told - seen[recorded]) <= SAME * (1 + np.abs(told))
+    expected = layout.observe(*inner)[recorded]
+    near = np.abs(expected - seen[recorded]) <= SAME * (1 + np.abs(expected))
     return bool(near.all() and np.isfinite(inner[0]).all())
 
 
 def _choose(
     recording: Recording, lead: int, count: int, rng: np.random.Generator, *, falls: bool
 ) -> list[tuple[int, int]]:
-    """(episode, step) of the steps to read, in the order of the file; each has `lead` steps before it."""
+    """Return (episode, step) of the steps to read, in the order of the file; each has `lead` steps before it."""
     ends = np.flatnonzero(recording.ended & (recording.steps > lead)) if falls else np.zeros(0, np.int64)
     ends = rng.permutation(ends)[: count // FALLS]
     room = np.maximum(recording.known - lead, 0)

@@ -27,7 +27,7 @@ from dds_lightning.tasks import Task
 class BehaviourCloning(StageModule):
     """Regress the data's actions on its observations.
 
-    A training batch is ``{"observations": (B, H, O), "actions": (B, H, A)}`` in the environment's own units;
+    A training batch is ``{"observations": (B, H, O), "actions": (B, H, A)}`` in the environment's units;
     each of the B x H steps is one sample.
 
     Args:
@@ -36,11 +36,11 @@ class BehaviourCloning(StageModule):
         hidden_dims: Widths of the hidden layers.
         lr: Adam's learning rate.
         lr_schedule: ``constant``, or ``cosine`` decay to zero at ``max_steps``.
-        init_from: ``.ckpt`` or published directory whose weights to start from (`dds_lightning.finetune`).
+        init_from: ``.ckpt`` or published directory with the initial weights (`dds_lightning.finetune`).
         refit_normaliser: With ``init_from``, take the statistics of the new data, not the checkpoint's.
 
     Raises:
-        UserError: A setting outside its range; the message names it.
+        UserError: A setting is outside its range; the message names it.
     """
 
     STAGE = "clone"
@@ -72,24 +72,24 @@ class BehaviourCloning(StageModule):
         self._begin(init_from)
 
     def unit_actions(self, observations: Tensor) -> Tensor:
-        """Actions (..., A) in [-1, 1] for observations (..., O)."""
+        """Return actions (..., A) in [-1, 1] for observations (..., O)."""
         return torch.tanh(self.net(self.normaliser(observations)))
 
     def forward(self, observations: Tensor) -> Tensor:
-        """Actions (..., A), in the environment's units and inside its box, for observations (..., O)."""
+        """Return actions (..., A), in the environment's units and inside its box, for observations (..., O)."""
         return self.action_box.from_unit(self.unit_actions(observations))
 
     def loss(self, batch: dict[str, Tensor]) -> Tensor:
-        """Mean squared error in units of half the action box, a scalar."""
+        """Return the mean squared error in units of half the action box, a scalar."""
         wanted = self.action_box.to_unit(batch["actions"])
         return (self.unit_actions(batch["observations"]) - wanted).square().mean()
 
     def on_fit_start(self) -> None:
-        """Take the data's statistics, unless a checkpoint brought them."""
+        """Use the data's statistics, unless a checkpoint provided them."""
         self.fit_units()
 
     def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
-        """One optimiser step's loss."""
+        """Return the loss of one optimiser step."""
         loss = self.loss(batch)
         if is_log_step(self):
             self.log("train/loss", loss.detach())
@@ -100,7 +100,7 @@ class BehaviourCloning(StageModule):
         self.log(f"{stage}/loss", self.loss(batch), prog_bar=stage == "val", batch_size=len(batch["actions"]))
 
     def predict_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
-        """Actions (B H, A) for the steps of a batch."""
+        """Return actions (B H, A) for the steps of a batch."""
         return self(batch["observations"]).flatten(0, 1)
 
 
@@ -108,7 +108,7 @@ class CloneActor:
     """A clone as an `Actor`: no skills, no noise, no memory.
 
     Args:
-        module: the trained policy; it is put in evaluation mode and used where it is.
+        module: The trained policy; it is put in evaluation mode and stays on its device.
     """
 
     def __init__(self, module: BehaviourCloning) -> None:
@@ -116,15 +116,15 @@ class CloneActor:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """The actor of a checkpoint that `fit_clone` wrote.
+        """Load the actor of a checkpoint that `fit_clone` wrote.
 
         Raises:
-            UserError: no such file, unreadable, or of another kind of model.
+            UserError: The file is missing, unreadable, or of another kind of model.
         """
         return cls(BehaviourCloning.load(path))
 
     def reset(self, num_envs: int, seed: int | None = None) -> None:
-        """Nothing to forget."""
+        """Does nothing: the actor has no memory."""
 
     @torch.inference_mode()
     def act(
@@ -133,7 +133,7 @@ class CloneActor:
         restarted: NDArray[np.bool_] | None = None,
         rows: NDArray[np.intp] | None = None,
     ) -> Acted:
-        """Actions (n, A) for observations (n, O); see `dds_lightning.rollout.actors.Actor.act`."""
+        """Return actions (n, A) for observations (n, O); see `dds_lightning.rollout.actors.Actor.act`."""
         x = torch.from_numpy(np.ascontiguousarray(observations, dtype=np.float32)).to(self.module.device)
         return Acted(self.module(x).float().cpu().numpy())
 
@@ -150,24 +150,24 @@ def fit_clone(
     hidden_dims: Sequence[int] = (256, 256),
     progress: bool = True,
 ) -> Path:
-    """Train the clone as `dds clone fit` does; goes on from `last.ckpt` if the directory holds one.
+    """Train the clone as `dds clone fit` does; continues from `last.ckpt` if the directory holds one.
 
     Args:
         task: The task that the data belong to.
-        data: As `SegmentDataModule` takes it, for example `local:DIR`.
-        directory: Where logs and checkpoint go.
-        seed: Of the weights, the split and the order of batches.
-        steps: Optimiser steps.
-        batch_size: Single steps of the data in a batch.
-        lr: Learning rate at the start.
+        data: Where the data are, for example `local:DIR`, see `SegmentDataModule`.
+        directory: Directory for logs and checkpoint.
+        seed: Seed of the weights, the split and the order of batches.
+        steps: Number of optimiser steps.
+        batch_size: Number of single steps of the data in a batch.
+        lr: Initial learning rate.
         hidden_dims: Widths of the hidden layers.
-        progress: Show a progress bar.
+        progress: Whether to show a progress bar.
 
     Returns:
         The checkpoint, which `CloneActor.load` reads.
 
     Raises:
-        UserError: Data that do not fit, or a setting outside its range.
+        UserError: The data do not fit, or a setting is outside its range.
     """
     from dds_lightning.training.stage_cli import command
 

@@ -1,9 +1,8 @@
 """The command line `dds`. Nothing heavy is imported before the command is known.
 
 A function of `commands` is a command: its signature is the command line and its docstring the help. `dds STAGE`, one
-for each training stage, is Lightning's own command line (`training.stage_cli`). What a command returns is printed, as
-text for a person or, with `--json`, as one JSON document with nothing beside it on standard output; progress and logs
-go to standard error.
+for each training stage, is Lightning's command line (`training.stage_cli`). What a command returns is printed, as
+text for people or, with `--json`, as a single JSON document on standard output; progress and logs go to standard error.
 """
 
 import shlex
@@ -21,20 +20,20 @@ from dds_lightning.training.stages import STAGES
 
 USAGE_ERROR = 2
 GOES_ON = ("run", "relabel", "data collect", "data fetch")
-"""Commands that find by themselves what an earlier call of theirs has done."""
+"""Commands that detect what an earlier, interrupted call has already done."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status: 0, 2 for what the user can mend, 128 + signal when interrupted.
+    """Run one command and return its exit status: 0, 2 for a user's error, 128 + signal when interrupted.
 
     Args:
-        argv: The words after `dds`; None takes them from the process.
+            argv: The arguments after `dds`; None takes them from the process.
     """
-    words = list(sys.argv[1:] if argv is None else argv)
+    arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         with caught(), warnings.catch_warnings():
             warnings.showwarning = _warn
-            return _dispatch(words)
+            return _dispatch(arguments)
     except UserError as error:
         return _complain(str(error))
     except (MemoryError, RuntimeError) as error:
@@ -42,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         return _complain(f"out of memory ({reason(error)}): ask for less at once, for example with fewer --workers")
     except Interrupted as stop:
-        print(f"dds: {_interrupted(words, stop)}", file=sys.stderr)
+        print(f"dds: {_interrupted(arguments, stop)}", file=sys.stderr)
         return int(stop.code or 1)
     except BrokenPipeError:
         # The reader has left (`dds tasks | head`); Python would complain again while closing standard output.
@@ -54,48 +53,48 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _complain(f"{error.filename}: {error.strerror}" if error.filename else str(error.strerror))
 
 
-def _dispatch(words: list[str]) -> int:
+def _dispatch(arguments: list[str]) -> int:
     from jsonargparse import ArgumentError
 
-    if words in (["--version"], ["-V"]):
+    if arguments in (["--version"], ["-V"]):
         print(f"dds-lightning {__version__}")
         return 0
     try:
-        if words and words[0] in STAGES:
+        if arguments and arguments[0] in STAGES:
             from dds_lightning.training.stage_cli import command
 
-            as_json, work = "--json" in words, command(words[0], words[1:])
+            as_json, work = "--json" in arguments, command(arguments[0], arguments[1:])
         else:
-            as_json, work = _command(words)
+            as_json, work = _command(arguments)
     except ArgumentError as error:
-        return _complain(f"{error.message} (see `{shlex.join(['dds', *_path(words)])} --help`)")
-    except SystemExit as stop:  # --help and --print_config end so
+        return _complain(f"{error.message} (see `{shlex.join(['dds', *_path(arguments)])} --help`)")
+    except SystemExit as stop:  # how --help and --print_config end
         if isinstance(stop, Interrupted):
             raise
         return int(stop.code or 0)
     return _report(work, as_json)
 
 
-def _path(words: list[str]) -> list[str]:
-    """The words that name a command: as many of the first as there are."""
+def _path(arguments: list[str]) -> list[str]:
+    """Return the leading arguments that name a command."""
     from dds_lightning.cli.parser import command_table
 
     path: list[str] = []
     table: Any = command_table()
-    for word in words:
-        if not isinstance(table, Mapping) or word not in table:
+    for argument in arguments:
+        if not isinstance(table, Mapping) or argument not in table:
             break
-        path.append(word)
-        table = table[word]
+        path.append(argument)
+        table = table[argument]
     return path
 
 
-def _command(words: list[str]) -> tuple[bool, Callable[[], Any]]:
-    """Parse the words of a command of ours."""
+def _command(arguments: list[str]) -> tuple[bool, Callable[[], Any]]:
+    """Parse the arguments of one of the commands defined here."""
     from dds_lightning.cli.parser import build_parser, prepare
 
     parser, functions = build_parser()
-    config = parser.parse_args(prepare(words or ["--help"]))
+    config = parser.parse_args(prepare(arguments or ["--help"]))
     name = config.pop("subcommand")
     settings = config.pop(name)
     while "subcommand" in settings:
@@ -107,7 +106,7 @@ def _command(words: list[str]) -> tuple[bool, Callable[[], Any]]:
 
 
 def _report(work: Callable[[], Any], as_json: bool) -> int:
-    """Do the work with standard output turned away, then print what it returned."""
+    """Do the work with standard output redirected to standard error, then print what it returned."""
     from dds_lightning.console.reports import Report
 
     with redirect_stdout(sys.stderr):
@@ -119,7 +118,7 @@ def _report(work: Callable[[], Any], as_json: bool) -> int:
 
 
 def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
-    """A warning as a sentence: where in the code it was raised says nothing to whoever types a command."""
+    """Print a warning as one sentence: where in the code it was raised means nothing to the user of a command."""
     print(f"dds: warning: {' '.join(str(message).split())}", file=sys.stderr)
 
 
@@ -128,19 +127,21 @@ def _complain(message: str) -> int:
     return USAGE_ERROR
 
 
-def _interrupted(words: list[str], stop: Interrupted) -> str:
-    """What was saved and which command goes on."""
-    if " ".join(_path(words)) in GOES_ON:
-        again = [word for word in words if not word.startswith("--fresh")]  # or it would begin anew
-        return f"interrupted; the same command goes on where it stopped:\n  {shlex.join(['dds', *again])}"
+def _interrupted(arguments: list[str], stop: Interrupted) -> str:
+    """Say what was saved and which command continues."""
+    if " ".join(_path(arguments)) in GOES_ON:
+        again = [
+            argument for argument in arguments if not argument.startswith("--fresh")
+        ]  # --fresh would start all over
+        return f"interrupted; the same command continues where it stopped:\n  {shlex.join(['dds', *again])}"
     if stop.saved is None:
-        same = shlex.join(["dds", *words])
+        same = shlex.join(["dds", *arguments])
         return f"interrupted before anything was saved; the same command begins again:\n  {same}"
     kept, skip = [], False
-    starts = ("--ckpt_path", "--model.init_from")  # a training that goes on does not start from anything
-    for word in words:
-        if not skip and not word.startswith(starts):
-            kept.append(word)
-        skip = word in starts
+    starts = ("--ckpt_path", "--model.init_from")  # a resumed training takes no initial weights
+    for argument in arguments:
+        if not skip and not argument.startswith(starts):
+            kept.append(argument)
+        skip = argument in starts
     command = shlex.join(["dds", *kept, "--ckpt_path", stop.saved])
-    return f"interrupted; the state is in {stop.saved}, and this goes on from it:\n  {command}"
+    return f"interrupted; the state is in {stop.saved}, and this command continues from it:\n  {command}"

@@ -9,7 +9,7 @@ from dds_lightning.console.reports import Report, pairs, table
 from dds_lightning.errors import UserError
 
 STAGES = 11
-"""What the progress bar counts when nothing is compared; about so many things are done."""
+"""Approximate number of steps, which the progress bar counts, when nothing is compared."""
 SHOWN = ("code", "share", "again", "recovered", "distance", "speed", "reward", "value", "alone")
 """Columns of the table that is printed; the page has them all."""
 
@@ -27,22 +27,24 @@ def atlas(
     """Look at the skills of a checkpoint: one HTML page with pictures, clips and numbers, which opens offline.
 
     Every skill is replayed in the task's environment, from the same states; episodes show how the policy strings them
-    together; tables say what each does in the data, and how well it is told from the behaviour that it produces.
+    together; tables say what each does in the data, and how well it can be recognised from its behaviour.
 
     With --json: `atlas` (the page), `task`, `horizon`, `num_skills`, `segments` (of the data that were encoded),
-    `skills` (a row a code), `round_trip` and `recovery` (accuracy, its error, chance, control, confusion, information
-    in bits), `transitions` and `distances` (K x K), `comparison` (a row a model, or null). What is not measured is
-    null.
+    `skills` (one row per code), `round_trip` and `recovery` (accuracy, its error, chance, control, confusion,
+    information in bits), `transitions` and `distances` (K x K), `comparison` (one row per model, or null). What is not
+    measured is null.
 
     Args:
-        place: a run of `dds run`, a published directory, hf:OWNER/NAME, or a skill checkpoint (.ckpt)
-        data: local:DIR, minari:ID, d4rl:FILE, arrays:DIR, or just a folder or file; a run knows its own
-        task: name of the task; without it the one that the checkpoint was made for
-        out: the HTML file to write
-        episodes: of the policy and of each single skill that are played, unless a run has played already; 0 for none
-        against: other skill checkpoints, for example of other seeds or with continuous skills, to compare with
-        seed: of everything random
-        figures: a folder in which each picture is also written as a small PNG file, named after the page
+        place: A run of `dds run`, a published directory, hf:OWNER/NAME, or a skill checkpoint (.ckpt).
+        data: Where the data are: local:DIR, minari:ID, d4rl:FILE, arrays:DIR, or just a folder or file; a run knows
+            where its data are.
+        task: Name of the task; without it the one that the checkpoint was made for.
+        out: The HTML file to write.
+        episodes: Episodes to play with the policy and with each single skill, unless a run has played them already;
+            0 for none.
+        against: Other skill checkpoints, for example of other seeds or with continuous skills, to compare with.
+        seed: Seed of everything random.
+        figures: A folder in which each picture is also written as a small PNG file, named after the page.
     """
     from dds_lightning.saving.hub import is_hub, pull
 
@@ -61,9 +63,9 @@ def atlas(
     from dds_lightning.console.progress import announcements
     from dds_lightning.study.subject import atlas as make
 
-    with announcements(STAGES + len(against)) as tell:
+    with announcements(STAGES + len(against)) as announce:
         others, folder = [Path(one) for one in against], Path(figures) if figures else None
-        made, path = make(root, spec, task, page, episodes, others, seed, folder, tell)
+        made, path = make(root, spec, task, page, episodes, others, seed, folder, announce)
     found, trip, shown = made.recovery, made.trip, made.table[[name for name in SHOWN if name in made.table]]
     lines = [
         ("codes in use", f"{len(found.codes)} of {len(made.table)}"),

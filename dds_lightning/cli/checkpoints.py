@@ -18,19 +18,19 @@ def publish(
     card: str | None = None,
     public: bool = False,
 ) -> Report:
-    """Make a directory of an agent that others can load and trust, or push it to the Hugging Face Hub.
+    """Publish an agent as a directory that others can load and trust, or push it to the Hugging Face Hub.
 
-    The directory holds the weights (safetensors), settings, scores, a card (a run's says which stage loses) and the
-    hashes of all files; nothing in it is ever run. It is verified before it takes its place.
+    The directory holds the weights (safetensors), settings, scores, a card (for a run, it says which stage loses) and
+    the hashes of all files; nothing in it is ever executed. It is verified before it is moved into place.
 
     Args:
-        run: a run of `dds run` or a directory that is published already; "-" with --skill
-        place: a new directory, or hf:OWNER/NAME
-        skill: skill checkpoint (.ckpt) instead of a run
-        policy: policy checkpoint (.ckpt) to go with it
-        task: name of the task to keep with it; without it the run's
-        card: a text file for README.md; without it the run's own card
-        public: make a new repository on the Hub public
+        run: A run of `dds run`, or a published directory; "-" with --skill.
+        place: A new directory, or hf:OWNER/NAME.
+        skill: Skill checkpoint (.ckpt) instead of a run.
+        policy: Policy checkpoint (.ckpt) to go with it.
+        task: Name of the task to keep with it; without it the run's.
+        card: A text file for README.md; without it the run's card.
+        public: Make a new repository on the Hub public.
     """
     from dds_lightning.agent import DDSAgent
     from dds_lightning.saving.hub import is_hub, push
@@ -78,7 +78,7 @@ def list_(root: list[str] = ["checkpoints", "runs"]) -> Report:  # noqa: B006 - 
     """List published agents under some folders, with what is wrong with them, if anything.
 
     Args:
-        root: folders to look in
+        root: Folders to look in.
     """
     from dds_lightning.sharing.verify import find_published
 
@@ -91,10 +91,10 @@ def list_(root: list[str] = ["checkpoints", "runs"]) -> Report:  # noqa: B006 - 
 def verify(directory: str) -> Report:
     """Check everything in a published directory: hashes, header, shapes, finite numbers, known answers.
 
-    Ends with status 2, saying what is wrong, if it is not sound.
+    If it is not sound, the message says what is wrong and the exit status is 2.
 
     Args:
-        directory: as published, or hf:OWNER/NAME
+        directory: A published directory, or hf:OWNER/NAME.
     """
     from dds_lightning.saving.hub import is_hub, pull
     from dds_lightning.sharing.verify import verify_published
@@ -111,19 +111,19 @@ def export(
     temperature: float | None = None,
     noise_scale: float | None = None,
 ) -> Report:
-    """Write an agent as one file that acts without this package, and compare both.
+    """Export an agent as one file that acts without this package, and compare the two.
 
     The file takes observations, codes in use (-1: choose), Gumbel noise for the choice and Gaussian noise for the
     decoder, and gives actions and codes; its metadata hold horizon and sizes. `dds_lightning/examples` has a program
     that acts with it.
 
     Args:
-        directory: a run of `dds run`, a published directory, or hf:OWNER/NAME
-        out: the file; without it NAME.onnx or NAME.pt2 in the current folder
-        format: onnx (any language), or torch (`torch.export.load`)
-        selection: how skills are chosen; without it as the agent does
-        temperature: of sampling; without it the agent's
-        noise_scale: of the decoder; without it the agent's
+        directory: A run of `dds run`, a published directory, or hf:OWNER/NAME.
+        out: The file; without it NAME.onnx or NAME.pt2 in the current folder.
+        format: Either onnx (any language), or torch (`torch.export.load`).
+        selection: How skills are chosen; without it as the agent does.
+        temperature: Sampling temperature; without it the agent's.
+        noise_scale: Factor on the decoder's noise; without it the agent's.
     """
     from dds_lightning.agent import DDSAgent
     from dds_lightning.saving.hub import is_hub, pull

@@ -1,6 +1,6 @@
 """The commands of `dds`, one function each: the signature is the command line, the docstring the help.
 
-Heavy imports stay inside the functions, so that `dds tasks` need not wait for torch.
+Heavy imports stay inside the functions, so that `dds tasks` does not wait for torch.
 """
 
 from pathlib import Path
@@ -36,11 +36,11 @@ def run(
 ) -> Report:
     """Do everything for one task: data, skills, relabelling, policy, baseline, evaluation, report.
 
-    What is done is not done twice: call it again after an interruption and it goes on where it stopped;
-    change a setting and the stages that it touches are done again. Every setting of a training stage can be given as
+    Finished stages are not repeated: call it again after an interruption and it continues where it stopped;
+    change a setting and the stages that depend on it are done again. Every setting of a training stage can be given as
     --STAGE.KEY=VALUE, for example --skill.trainer.max_steps=500 --policy.model.alpha=5.
 
-    A task of several physics (`dds tasks NAME`) is played in the one in which the data were recorded.
+    A task with several physics variants (`dds tasks NAME`) is played in the one in which the data were recorded.
 
     With --json: `task` (with the variant of the data), `out`, `seed`, `seconds` and `outputs` of each stage,
     `done_before`; after the report also `main` (the contestant that the run is about), `protocol` (as `dds evaluate
@@ -50,26 +50,28 @@ def run(
     measured is null.
 
     Args:
-        task: name of a task (`dds tasks` lists them), a task file of your own (.yaml), or package.module:NAME
-        out: folder of the run; without it runs/TASK
-        data: your data, local:DIR, minari:ID, d4rl:FILE or arrays:DIR; without it data are collected in the environment
-        seed: of everything random: data, both trainings and the evaluation
-        preset: packaged configurations (antmaze, kitchen, locomotion, pointmaze, paper), or a folder with skill.yaml,
+        task: Name of a task (`dds tasks` lists them), a task file of your own (.yaml), or package.module:NAME.
+        out: Folder of the run; without it runs/TASK.
+        data: Your data, local:DIR, minari:ID, d4rl:FILE or arrays:DIR; without it data are collected in the
+            environment.
+        seed: Seed of everything random: data, both trainings and the evaluation.
+        preset: Packaged configurations (antmaze, kitchen, locomotion, pointmaze, paper), or a folder with skill.yaml,
             policy.yaml and, if you like, run.yaml (data_steps, clone_steps, selection, temperature, noise_scale);
-            without it the task family's
-        data_steps: environment steps to collect; without it the preset's, as for clone_steps, selection, temperature
-        clone_steps: optimiser steps of the behaviour-cloning baseline
-        evaluate_every: steps between two evaluations of 10 episodes while the policy trains; the best checkpoint by
-            their score is told beside the last; 0 for none; without it a quarter of the training, on PointMaze none
-        episodes: evaluation episodes of each contestant; without it the task's own number
-        episodes_per_skill: evaluation episodes of each single skill alone
-        selection: how the published agent chooses skills; the table shows every way
-        temperature: of `sample`; below 1 is nearer to greedy
-        noise_scale: factor on the decoder's noise when acting; without it the preset's, or the skill model's own
-        workers: processes for environments; without it one for every core
-        until: the last stage to do
-        fresh: do every stage again
-        **stages: settings for `dds STAGE fit` of each training stage, see above
+            without it the task family's.
+        data_steps: Environment steps to collect; without it the preset's, as for clone_steps, selection, temperature.
+        clone_steps: Optimiser steps of the behaviour-cloning baseline.
+        evaluate_every: Steps between two evaluations of 10 episodes while the policy trains; the best checkpoint by
+            their score is reported beside the last; 0 for none; without it a quarter of the training, on PointMaze
+            none.
+        episodes: Evaluation episodes of each contestant; without it the task's default.
+        episodes_per_skill: Evaluation episodes of each single skill alone.
+        selection: How the published agent chooses skills; the table shows every way.
+        temperature: Temperature of `sample`; below 1 is nearer to greedy.
+        noise_scale: Factor on the decoder's noise when acting; without it the preset's or the skill model's.
+        workers: Number of processes for the environments; without it one per core.
+        until: The last stage to do.
+        fresh: Do every stage again.
+        **stages: Settings for `dds STAGE fit` of each training stage, see above.
     """
     from dds_lightning.pipeline.run import run_all
     from dds_lightning.pipeline.settings import RunSettings
@@ -108,11 +110,11 @@ def relabel(
     """Turn a data set into transitions between skills, and show how the codes are used.
 
     Args:
-        skill: skill checkpoint, a .ckpt file or a published directory
-        data: local:DIR, minari:ID, d4rl:FILE, arrays:DIR, or just a folder or file
-        task: name of the task; it decides how rewards are read
-        out: file to write; without it the cache beside the checkpoint, where `dds policy fit` looks
-        **relabelling: fields of `datamodules.relabelling.Relabelling`
+        skill: Skill checkpoint, a .ckpt file or a published directory.
+        data: Where the data are: local:DIR, minari:ID, d4rl:FILE, arrays:DIR, or just a folder or file.
+        task: Name of the task; it decides how rewards are read.
+        out: File to write; without it the cache beside the checkpoint, where `dds policy fit` looks.
+        **relabelling: Fields of `datamodules.relabelling.Relabelling`.
     """
     from datamodules.relabel import Relabelled
     from datamodules.relabelled import RelabeledDataModule
@@ -147,7 +149,7 @@ def evaluate(
     """Roll out a trained agent in its environment and print its scores.
 
     The best checkpoint of a run was chosen by playing in the environment while it trained, so its figures are
-    optimistic; published scores are to be held against the last.
+    optimistic; compare published scores with the last one.
 
     With --json: `agent` and `best` (directories of the last and the best checkpoint, null if they do not play),
     `task`, `seed`, `protocol` (task with variant, environment, episodes, seed, checkpoint, noise_scale and sampler
@@ -157,16 +159,16 @@ def evaluate(
     What is not measured is null.
 
     Args:
-        directory: a run of `dds run`, or a published checkpoint
-        task: name of the task; without it the one the agent was made for
-        episodes: episodes for each way of choosing skills; without it the task's own number
-        selection: how skills are chosen: greedy, sample, argmax_q, random; several give one row each
-        temperature: of `sample`; below 1 is nearer to greedy
-        noise_scale: factor on the decoder's noise; without it the agent's own
-        checkpoint: which of a run's checkpoints; both means the last and, where the run kept one, the best
-        seed: of the environments and of sampling
-        workers: processes for environments; without it one for every core
-        out: Parquet file for the table of episodes
+        directory: A run of `dds run`, or a published checkpoint.
+        task: Name of the task; without it the one the agent was made for.
+        episodes: Episodes for each way of choosing skills; without it the task's default.
+        selection: How skills are chosen: greedy, sample, argmax_q, random; several give one row each.
+        temperature: Temperature of `sample`; below 1 is nearer to greedy.
+        noise_scale: Factor on the decoder's noise; without it the agent's.
+        checkpoint: Which of a run's checkpoints; both means the last and, where the run kept one, the best.
+        seed: Seed of the environments and of sampling.
+        workers: Number of processes for the environments; without it one per core.
+        out: Parquet file for the table of episodes.
     """
     from dds_lightning.study.evaluate import evaluate as play
 
@@ -188,7 +190,7 @@ def report(directory: str) -> Report:
     """Draw the report of a finished run once more: table, figures, clip.
 
     Args:
-        directory: a run of `dds run`
+        directory: A run of `dds run`.
     """
     from dds_lightning.study.report import report as draw
 
@@ -198,18 +200,18 @@ def report(directory: str) -> Report:
 def data_check(data: str, task: str | None = None, horizon: int | None = None, replay: int = 0) -> Report:
     """Read a data set from end to end and say what is wrong with it, if anything.
 
-    With --replay the simulator is put into recorded states and takes the recorded actions: where it leads elsewhere
-    than the recording, or pays other rewards, the data were made in another environment, and the exit status is 1.
+    With --replay the simulator is put into recorded states and takes the recorded actions: if it ends up elsewhere
+    than the recording, or pays other rewards, the data come from another environment, and the exit status is 1.
 
     With --json: `data`, `task`, `sound`, `facts`, `replay` (null without it): `steps`, `verdict` (fit or misfit),
     `physics` (one for every variant of the task, with its error, limit, verdict, rewards and table of dimensions) and
     `notes`.
 
     Args:
-        data: local:DIR, minari:ID, d4rl:FILE, arrays:DIR, or just a folder or file
-        task: name of the task that the data should fit
-        horizon: also count segments of this many steps, and refuse data without one
-        replay: steps to replay in the task's environment, 200 say; 0 for none
+        data: Where the data are: local:DIR, minari:ID, d4rl:FILE, arrays:DIR, or just a folder or file.
+        task: Name of the task that the data should fit.
+        horizon: Also count segments of this many steps, and refuse data without one.
+        replay: Number of steps to replay in the task's environment, for example 200; 0 for none.
     """
     from datamodules.inspection import check_dataset
 
@@ -237,10 +239,10 @@ def data_check(data: str, task: str | None = None, horizon: int | None = None, r
 
 
 def tasks(name: str | None = None) -> Report:
-    """List the tasks, or tell everything about one: environment, episodes, maze, rewards, scores, data.
+    """List the tasks, or show everything about one: environment, episodes, maze, rewards, scores, data.
 
     Args:
-        name: of one task or of one of its variants, for example antmaze-umaze@robotics
+        name: Name of one task or of one of its variants, for example antmaze-umaze@robotics.
     """
     from dds_lightning.tasks import get_task, task_names, task_table
     from dds_lightning.tasks.facts import draw_maze, task_facts, task_lines
@@ -258,7 +260,7 @@ def tasks(name: str | None = None) -> Report:
             *shown,
             "O/A: widths of observations and actions. score range: the returns that count as 0 and as 100.",
             "paper: its scores, with D4RL's data in D4RL's physics; not to be compared with those of other data.",
-            "`dds tasks NAME` tells everything about one task, its maze and its data included.",
+            "`dds tasks NAME` shows everything about one task, including its maze and its data.",
         ],
     )
 

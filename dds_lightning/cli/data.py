@@ -24,15 +24,15 @@ def list_(root: list[str] = ["data"]) -> Report:  # noqa: B006 - jsonargparse sh
     """List data sets and the tasks that they fit: in Minari's folder, in D4RL's and in your own folders.
 
     Args:
-        root: folders to search besides MINARI_DATASETS_PATH (or ~/.minari/datasets) and D4RL_DATASET_DIR (or
-            ~/.d4rl/datasets)
+        root: Folders to search besides MINARI_DATASETS_PATH (or ~/.minari/datasets) and D4RL_DATASET_DIR (or
+            ~/.d4rl/datasets).
     """
     from datamodules.listing import find_datasets
 
     found = find_datasets(root)
     if found.empty:
         where = ", ".join(["Minari's folder", "D4RL's folder", *root])
-        advice = "make one with `dds data collect TASK`, or fetch one with `dds data fetch TASK`"
+        advice = "collect one with `dds data collect TASK`, or fetch one with `dds data fetch TASK`"
         return Report(found, [f"no data sets in {where}; {advice}"])
     shown = found.assign(tasks=[", ".join(names) or "none" for names in found["tasks"]])
     return Report(found, [table(shown[["data", "tasks", "episodes", "steps", "problem"]])])
@@ -51,11 +51,11 @@ def show(
     that were visited.
 
     Args:
-        data: local:DIR, minari:ID, d4rl:FILE, arrays:DIR, or just a folder or file
-        task: name of the task; with it dimensions have names, mazes have walls, and rewards are those of its goal
-        episodes: number of rows in the table of episodes
-        out: file of the figure (.png, .pdf or .svg); without it show/NAME.png in the current folder
-        no_figure: print the tables only
+        data: Where the data are: local:DIR, minari:ID, d4rl:FILE, arrays:DIR, or just a folder or file.
+        task: Name of the task; with it dimensions have names, mazes have walls, and rewards are those of its goal.
+        episodes: Number of rows in the table of episodes.
+        out: File of the figure (.png, .pdf or .svg); without it show/NAME.png in the current folder.
+        no_figure: Print the tables only.
     """
     from datamodules.inspection import describe, episode_table
     from datamodules.sources import load_trajectories
@@ -97,9 +97,9 @@ def fetch(task: str, source: Literal["d4rl", "minari"] = "d4rl", out: str | None
     """Download a task's published data set; repeat the command after an interruption to continue.
 
     Args:
-        task: name of a task; `dds tasks NAME` says which data each source has for it
-        source: d4rl (the data behind the paper's scores) or minari
-        out: folder for it; without it the source's own
+        task: Name of a task; `dds tasks NAME` says which data each source has for it.
+        source: Either d4rl (the data behind the paper's scores) or minari.
+        out: Folder for it; without it the source's default folder.
     """
     from datamodules.sources.fetch import fetch as fetch_data
 
@@ -125,14 +125,14 @@ def collect(
     Repeat the command after an interruption to continue where it stopped.
 
     Args:
-        task: name of a task; `dds tasks` lists them
-        steps: environment steps
-        seed: the same seed gives the same bytes of every array, whatever the number of workers
-        out: folder of data sets; the new one is a folder in it
-        workers: processes; without it one for every core
-        overwrite: replace a data set of the same name
-        recipe: what the behaviour does, one flag per setting, such as --recipe.action_noise=0.1 or, for AntMaze,
-            --recipe.end_when_flipped=true; an unknown name is answered with the known ones
+        task: Name of a task; `dds tasks` lists them.
+        steps: Environment steps.
+        seed: The same seed gives the same bytes of every array, whatever the number of workers.
+        out: Folder of data sets; the new one is a folder in it.
+        workers: Number of processes; without it one per core.
+        overwrite: Replace a data set of the same name.
+        recipe: What the behaviour does, one flag per setting, such as --recipe.action_noise=0.1 or, for AntMaze,
+            --recipe.end_when_flipped=true; the error for an unknown name lists the known ones.
     """
     from datamodules.collect.collectors import collect as collect_data
 

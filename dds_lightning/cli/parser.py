@@ -17,8 +17,8 @@ GROUPS = {
     "data": "List, show, check, fetch and collect data sets.",
     "checkpoints": "List and verify published agents.",
 }
-OPTIONAL_WORDS = {commands.tasks: "name"}
-"""Functions with a parameter that has a default and is typed without its name all the same."""
+OPTIONAL_POSITIONALS = {commands.tasks: "name"}
+"""Functions with a parameter that has a default but is still a positional argument."""
 TAKES_STAGES = (commands.run,)
 """Functions that take the arguments of each training stage as a keyword of its name."""
 
@@ -47,7 +47,7 @@ def command_table() -> Commands:
 
 
 def build_parser() -> tuple[ArgumentParser, dict[str, Callable[..., Any]]]:
-    """Build the parser and the functions by the words that call them ("data check")."""
+    """Build the parser, and the functions by the command that calls them ("data check")."""
     parser = ArgumentParser(
         prog="dds",
         description="Discrete diffusion skills for offline reinforcement learning.",
@@ -66,7 +66,7 @@ def _add(parser: ArgumentParser, table: Commands, functions: dict[str, Callable[
             subcommands.add_subcommand(name, ArgumentParser(exit_on_error=False), help=STAGES[name].description)
         elif isinstance(entry, Mapping):
             group = ArgumentParser(description=GROUPS[name], exit_on_error=False)
-            subcommands.add_subcommand(name, group, help=GROUPS[name])  # before its own: jsonargparse's order
+            subcommands.add_subcommand(name, group, help=GROUPS[name])  # before its commands, for jsonargparse
             _add(group, entry, functions, prefix=f"{name} ")
         else:
             documentation = inspect.getdoc(entry) or ""
@@ -74,7 +74,7 @@ def _add(parser: ArgumentParser, table: Commands, functions: dict[str, Callable[
             about = documentation.split("\nArgs:", 1)[0].strip()
             leaf = ArgumentParser(description=about, exit_on_error=False)
             leaf.add_argument("--json", action="store_true", help="print one JSON document and nothing else")
-            optional = OPTIONAL_WORDS.get(entry)
+            optional = OPTIONAL_POSITIONALS.get(entry)
             if optional:
                 leaf.add_argument(optional, nargs="?", help=_help(documentation, optional))
             leaf.add_function_arguments(
@@ -99,14 +99,14 @@ def _help(documentation: str, parameter: str) -> str:
     return described.get(parameter) or ""
 
 
-def prepare(words: list[str]) -> list[str]:
-    """Rewrite the two shorthands that jsonargparse does not know.
+def prepare(arguments: list[str]) -> list[str]:
+    """Expand the two shorthands that jsonargparse does not know.
 
     A bare `--fresh` means `--fresh=true`, and for `dds run` an option like `--skill.trainer.max_steps=100`
-    (or the same as two words) is collected for the `fit` command of that stage.
+    (or the same as two arguments) is collected for the `fit` command of that stage.
 
     Raises:
-        UserError: Such an option without a value.
+        UserError: Such an option has no value.
     """
     flags = {
         f"--{name}"
@@ -115,16 +115,16 @@ def prepare(words: list[str]) -> list[str]:
         if parameter.default is False
     }
     out: list[str] = []
-    rest = iter(words)
-    for word in rest:
-        stage, _, option = word.removeprefix("--").partition(".")
-        if words[0] == "run" and word.startswith("--") and stage in STAGES and option:
+    rest = iter(arguments)
+    for argument in rest:
+        stage, _, option = argument.removeprefix("--").partition(".")
+        if arguments[0] == "run" and argument.startswith("--") and stage in STAGES and option:
             if "=" not in option:
                 value = next(rest, None)
                 if value is None:
-                    raise UserError(f"{word} has no value: write {word}=VALUE")
+                    raise UserError(f"{argument} has no value: write {argument}=VALUE")
                 option = f"{option}={value}"
             out.append(f"--{stage}+=--{option}")
         else:
-            out.append(f"{word}=true" if word in flags else word)
+            out.append(f"{argument}=true" if argument in flags else argument)
     return out

@@ -1,1 +1,1 @@
-"""Environments: built from a task's row, and many of them side by side in processes of their own."""
+"""Environments: built from a task's row, and many of them side by side in worker processes."""

@@ -1,6 +1,6 @@
-"""D4RL's AntMaze, rebuilt from Gymnasium's Ant: D4RL's own files belong in this physics, not in gymnasium-robotics'.
+"""D4RL's AntMaze, rebuilt from Gymnasium's Ant: D4RL's files fit this physics, not that of gymnasium-robotics.
 
-The body of both is the same to the gram; all else that decides what an action does, differs:
+The bodies have the same mass to the gram; everything else that determines the effect of an action differs:
 
 | | here, as D4RL | gymnasium-robotics (`@robotics`) |
 |---|---|---|
@@ -31,10 +31,10 @@ TIMESTEP = 0.02
 FRAME_SKIP = 5
 TORQUE = 30.0
 WALL_HEIGHT = 0.5
-"""In cells; the wall cells' boxes fill their squares."""
+"""In cells; the boxes of wall cells fill their squares."""
 SOLREF, SOLIMP = "0.02 1", "0.8 0.8 0.01"
 POSE_NOISE = 0.1
-"""Half the width of the uniform noise on every qpos at a reset, and the deviation of the normal one on qvel."""
+"""Half the width of the uniform noise on every qpos at a reset, and the standard deviation of the noise on qvel."""
 GOAL_NOISE = (1.0, 0.5)
 """A goal is moved from its cell's centre, on both axes, by a sum of uniform draws from 0 to each of these."""
 
@@ -50,17 +50,17 @@ class D4RLAntMazeEnv(MujocoEnv, EzPickle):
     goes on. `info` holds `position` (2,) and `goal` (2,) in metres and `success`. Facts: D4RL's source
     (commit 89141a6).
 
-    What the installed MuJoCo does otherwise than the one D4RL recorded with: since 2.1.2 capsules have their
-    exact volume, so that the same body weighs 0.911 kg and not 0.879 kg, and the inertias of its limbs differ.
-    Recorded steps are therefore repeated nearly, not exactly.
+    The installed MuJoCo differs from the version that D4RL recorded with: since 2.1.2 capsules have their exact
+    volume, so the same body weighs 0.911 kg instead of 0.879 kg, and the inertias of its limbs differ. Recorded
+    steps are therefore reproduced approximately, not exactly.
 
     Args:
         maze_map: Rows of the maze, "1" wall and "0" free.
         start_cell: (row, column) whose centre is (0, 0); y grows with the row.
-        goal_cell: (row, column) round which goals are drawn.
+        goal_cell: (row, column) around which goals are drawn.
         cell_size: Side of a cell in metres.
         goal_radius: Distance in metres that counts as reaching the goal.
-        render_mode: Gymnasium's; without one, textures are left out and the model builds in a few milliseconds.
+        render_mode: Gymnasium's render mode; if None, textures are left out and the model builds in a few milliseconds.
         **kwargs: Passed to `MujocoEnv`: `width`, `height`, `camera_id`, `camera_name` and the like.
     """
 
@@ -117,7 +117,7 @@ class D4RLAntMazeEnv(MujocoEnv, EzPickle):
         for motor in root.iterfind("actuator/motor"):
             motor.set("gear", "1")
             motor.set("ctrlrange", f"{-TORQUE} {TORQUE}")
-        if not self._seen:  # drawing textures takes many times as long as all the rest
+        if not self._seen:  # creating textures takes many times as long as everything else
             for texture in root.iterfind("asset/texture"):
                 texture.set("width", "1")
                 texture.set("height", "1")
@@ -157,16 +157,16 @@ class D4RLAntMazeEnv(MujocoEnv, EzPickle):
         """Start an episode.
 
         Args:
-            seed: Of goal and pose.
-            options: Any of `reset_cell` (row, column) in place of the start cell, `goal` (2,) metres in place
-                of a drawn one, and `noise`: False puts the ant in the model's pose, at rest.
+            seed: Seed of goal and pose.
+            options: Any of `reset_cell` (row, column) instead of the start cell, `goal` (2,) metres instead of a drawn
+                one, and `noise`; False puts the ant in the model's pose, at rest.
 
         Raises:
-            UserError: An option of another name, or a cell that is not free.
+            UserError: An option is unknown, or the cell is not free.
         """
         options = {name: value for name, value in (options or {}).items() if value is not None}
         if unknown := set(options) - {"reset_cell", "goal", "noise"}:
-            raise UserError(f"reset has no option '{min(unknown)}': leave it out, or give reset_cell, goal or noise")
+            raise UserError(f"reset has no option '{min(unknown)}', expected reset_cell, goal or noise")
         super().reset(seed=seed)
         qpos, qvel = self.data.qpos.copy(), self.data.qvel.copy()
         if not options.get("noise", True):
@@ -192,11 +192,11 @@ class D4RLAntMazeEnv(MujocoEnv, EzPickle):
         i, j = (int(value) for value in cell)
         inside = 0 <= i < len(self.maze_map) and 0 <= j < len(self.maze_map[0])
         if not inside or self.maze_map[i][j] == "1":
-            raise UserError(f"reset_cell is {(i, j)}, a wall or outside of the maze: give a free (row, column)")
+            raise UserError(f"reset_cell is {(i, j)}, a wall or outside the maze: give a free (row, column)")
         return i, j
 
     def step(self, action: NDArray[Any]) -> tuple[State, float, bool, bool, dict[str, Any]]:  # type: ignore[override]
-        """A tenth of a second."""
+        """Simulate a tenth of a second."""
         self.do_simulation(TORQUE * np.clip(action, -1.0, 1.0), self.frame_skip)
         info = self._info()
         if self.render_mode == "human":
@@ -204,7 +204,7 @@ class D4RLAntMazeEnv(MujocoEnv, EzPickle):
         return self._observation(), float(info["success"]), info["success"], False, info
 
     def render(self) -> Any:
-        """The picture that `render_mode` asks for, the maze from above unless a camera was named."""
+        """Return the picture that `render_mode` asks for, of the maze from above unless a camera was named."""
         self.model.site("target").pos[:] = [*self.goal, self.goal_radius]
         return super().render()
 

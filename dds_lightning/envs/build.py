@@ -1,4 +1,4 @@
-"""Building environments: the only place that does, so that every process does it safely."""
+"""The only place where environments are built, so that every process does it safely."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _BUILD_LOCK = threading.Lock()
 
 
 def register_environments() -> None:
-    """Make gymnasium-robotics' environments and ours known to Gymnasium; slow the first time, so done late."""
+    """Register gymnasium-robotics' environments and ours with Gymnasium; slow the first time, so done late."""
     with _BUILD_LOCK, contextlib.redirect_stderr(io.StringIO()):  # it prints a notice on others
         import gymnasium_robotics
 
@@ -42,20 +42,20 @@ def register_environments() -> None:
 def build_env(env_id: str | EnvSpec, **kwargs: Any) -> gym.Env[Any, Any]:
     """`gymnasium.make` for any of our environments, safe to call from many processes at once.
 
-    A maze writes its MuJoCo XML into the temporary directory under the time of day and never deletes it. Two
-    processes can meet on one name, and every environment leaves a file behind. Here each environment gets a
-    temporary directory of its own, which goes as soon as MuJoCo has read the file.
+    A maze writes its MuJoCo XML into the temporary directory, names it after the time of day and never deletes it. Two
+    processes can choose the same name, and every environment leaves a file behind. Here each environment gets its own
+    temporary directory, which is removed as soon as MuJoCo has read the file.
 
     Args:
-        env_id: Gymnasium's name of the environment, or a specification of our own making.
+        env_id: Gymnasium's name of the environment, or a specification created here.
         **kwargs: Passed on to `gymnasium.make`; None values are left out.
     """
     register_environments()
     kwargs = {key: value for key, value in kwargs.items() if value is not None}
-    with _BUILD_LOCK, tempfile.TemporaryDirectory(prefix="dds-env-") as own, warnings.catch_warnings():
+    with _BUILD_LOCK, tempfile.TemporaryDirectory(prefix="dds-env-") as folder, warnings.catch_warnings():
         # The table names versions on purpose: a score belongs to the physics that its data come from.
         warnings.filterwarnings("ignore", message=".*is out of date.*")
-        before, tempfile.tempdir = tempfile.tempdir, own
+        before, tempfile.tempdir = tempfile.tempdir, folder
         try:
             return gym.make(env_id, disable_env_checker=True, **kwargs)
         finally:

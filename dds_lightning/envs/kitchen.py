@@ -2,7 +2,7 @@
 
 ```
  0        9                  30                 60
- │ robot  │ objects          │ goal             │     positions only; the goal is 0 but for the four subtasks
+ │ robot  │ objects          │ goal             │     positions only; the goal is 0 except for the four subtasks
 ```
 """
 
@@ -26,11 +26,11 @@ SUBTASKS: dict[str, tuple[tuple[int, ...], tuple[float, ...]]] = {
     "microwave": ((22,), (-0.75,)),
     "kettle": ((23, 24, 25, 26, 27, 28, 29), (-0.23, 0.75, 1.62, 0.99, 0.0, 0.0, -0.06)),
 }
-"""Subtask -> columns of the observation, and their values when it is done."""
+"""Subtask -> its columns of the observation, and their values when it is done."""
 
 
 def kitchen_layout(observation: ArrayLike) -> NDArray[Any]:
-    """Positions of robot and objects from gymnasium-robotics' observation.
+    """Return the positions of robot and objects from gymnasium-robotics' observation.
 
     Args:
         observation: (..., 59) robot positions 9 and velocities 9, object positions 21 and velocities 20.
@@ -43,7 +43,7 @@ def kitchen_layout(observation: ArrayLike) -> NDArray[Any]:
 
 
 def goal_vector(subtasks: Sequence[str]) -> NDArray[np.float64]:
-    """The 30 goal numbers of some subtasks."""
+    """Return the 30 goal numbers of some subtasks."""
     goal = np.zeros(30)
     for name in subtasks:
         columns, values = SUBTASKS[name]
@@ -52,7 +52,7 @@ def goal_vector(subtasks: Sequence[str]) -> NDArray[np.float64]:
 
 
 def subtasks_done(observations: ArrayLike, subtasks: Sequence[str]) -> NDArray[np.bool_]:
-    """Which subtasks are done in some states.
+    """Return which subtasks are done in some states.
 
     Args:
         observations: (..., 30 or 60).

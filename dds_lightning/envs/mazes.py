@@ -1,4 +1,4 @@
-"""The mazes: their maps, and the three AntMazes of D4RL that we register with Gymnasium ourselves."""
+"""The mazes: their maps, and D4RL's three AntMazes, which this package registers with Gymnasium."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ class AntMaze(NamedTuple):
     """One AntMaze in D4RL's physics.
 
     Attributes:
-        maze_map: rows of the maze, "1" wall and "0" free.
-        cap: steps of an evaluation episode.
-        goal_cell: (row, column) round which goals are drawn.
+        maze_map: Rows of the maze, "1" wall and "0" free.
+        cap: Maximum number of steps of an evaluation episode.
+        goal_cell: (row, column) around which goals are drawn.
         start_cell: (row, column) where episodes start; the origin of the coordinates.
-        cell_size: side of a cell in metres.
-        goal_radius: distance in metres that counts as reaching the goal.
+        cell_size: Side of a cell in metres.
+        goal_radius: Distance in metres that counts as reaching the goal.
     """
 
     maze_map: tuple[str, ...]
@@ -44,9 +44,9 @@ D4RL_ANTMAZES = {
     "Medium": AntMaze(MEDIUM, 1000, (6, 6)),
     "Large": AntMaze(LARGE, 1000, (7, 9)),
 }
-"""Size, as in the environment's id, to the maze."""
+"""Size, as in the environment's id, -> the maze."""
 
 
 def d4rl_antmaze_id(size: str) -> str:
-    """Gymnasium's name of an AntMaze in D4RL's physics."""
+    """Return Gymnasium's name of an AntMaze in D4RL's physics."""
     return f"dds/AntMazeD4RL_{size}-v0"

@@ -1,17 +1,17 @@
-"""Many environments of one task, stepped by worker processes while the caller only acts.
+"""Many environments of one task, stepped by worker processes, while the caller only chooses actions.
 
 ```
  caller    actions (n, A) ─┬─ pipe ─► worker 0: envs 0, 2, 4, ..  step, and reset to the slot's next seed ─┐
                            └─ pipe ─► worker 1: envs 1, 3, 5, ..                                          ─┤
-           one record a live slot ◄────────────────────────────────────────────────────────────────── pipe ┘
+           one record per live slot ◄────────────────────────────────────────────────────────────────── pipe ┘
 ```
 
-A slot plays a fixed list of seeds one after the other, so short episodes are never over-counted; a slot
-whose list is done is neither stepped nor acted upon. Workers are plain `python -c` children: they work from
+Each slot plays a fixed list of seeds in order, so short episodes are never over-counted; a slot whose list is
+finished is no longer stepped. Workers are plain `python -c` children: they work from
 notebooks, from scripts without a `__main__` guard and under pytest, import no torch, and end when their
 caller does, because their input ends. gymnasium's and stable-baselines3's vector environments offer none of this: they
-reset to seeds of their own choice, step every slot until the end, and their processes need a `__main__` guard. They do
-serve where data are endless, as in online training.
+choose the seeds of later episodes themselves, step every slot until the end, and their processes need a `__main__`
+guard. They do suit endless data, as in online training.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class EnvPoolError(RuntimeError):
 
 
 class _Local:
-    """Slots in the caller's own process: nothing to start, easy to debug."""
+    """Slots in the caller's process: nothing to start, easy to debug."""
 
     def __init__(self, task: Task, count: int) -> None:
         self.slots = Slots(task, count)
@@ -62,7 +62,7 @@ class _Local:
 
 
 class _Remote:
-    """Slots in a worker process, spoken to through its standard input and output."""
+    """Slots in a worker process, which communicates through its standard input and output."""
 
     def __init__(self, task: Task, count: int, name: str) -> None:
         self.name = name
@@ -122,13 +122,13 @@ class EnvPool:
     number of workers.
 
     Args:
-        task: what to build; must be picklable when there are workers.
-        num_envs: slots E.
-        workers: processes; None one a core, 0 steps in the calling process.
+        task: The task to build; must be picklable if there are workers.
+        num_envs: Number of slots E.
+        workers: Number of processes; None starts one per core, 0 steps in the calling process.
 
     Raises:
-        UserError: `num_envs` or `workers` out of range.
-        EnvPoolError: an environment could not be built.
+        UserError: `num_envs` or `workers` is out of range.
+        EnvPoolError: An environment could not be built.
     """
 
     def __init__(self, task: Task, num_envs: int, workers: int | None = None) -> None:
@@ -141,7 +141,7 @@ class EnvPool:
             raise UserError(f"workers is {workers}, expected 0 (no processes) or more")
         workers = min(workers, num_envs)
         self.task, self.num_envs, self.workers = task, num_envs, workers
-        # Neighbouring slots play alike contestants, so deal them out: part p has slots p, p + parts, ...
+        # Neighbouring slots play similar contestants, so deal them out: part p has slots p, p + parts, ...
         parts = max(workers, 1)
         self._slots = [np.arange(part, num_envs, parts) for part in range(parts)]
         self._parts: list[_Local | _Remote] = []
@@ -152,9 +152,9 @@ class EnvPool:
                 name = f"environment worker {part} of {workers} ({task.name})"
                 count = len(self._slots[part])
                 self._parts.append(_Remote(task, count, name) if workers else _Local(task, count))
-            for own in self._parts:
-                if isinstance(own, _Remote):
-                    own.receive()
+            for started in self._parts:
+                if isinstance(started, _Remote):
+                    started.receive()
         except BaseException:
             self.close()
             raise
@@ -166,17 +166,17 @@ class EnvPool:
         return np.flatnonzero(self._alive)
 
     def start(self, seeds: Sequence[Sequence[int]]) -> NDArray[Any]:
-        """Begin the first episode of every slot; a rollout in progress is abandoned.
+        """Start the first episode of every slot; a rollout in progress is abandoned.
 
         Args:
-            seeds: for each slot the seeds of its episodes; an empty or missing list leaves it idle.
+            seeds: For each slot the seeds of its episodes; an empty or missing list leaves it idle.
 
         Returns:
             (E,) records, see `record_dtype`; only `observation`, `position` and `alive` are filled.
         """
         if len(seeds) > self.num_envs:
-            raise UserError(f"{len(seeds)} slots wanted, but the pool has {self.num_envs} environments")
-        plan = [list(map(int, own)) for own in seeds] + [[] for _ in range(self.num_envs - len(seeds))]
+            raise UserError(f"seeds has {len(seeds)} lists, expected at most {self.num_envs}, one per environment")
+        plan = [list(map(int, each)) for each in seeds] + [[] for _ in range(self.num_envs - len(seeds))]
         records = np.zeros(self.num_envs, record_dtype(self.task))
         with self._exchange():
             for part, own in zip(self._parts, self._slots, strict=True):
@@ -213,9 +213,9 @@ class EnvPool:
 
     @contextlib.contextmanager
     def _exchange(self) -> Any:
-        """Close the pool when an exchange is cut short: its answers would be taken for the next one's."""
+        """Close the pool if an exchange is interrupted: its answers would be taken for the next one's."""
         if self._broken:
-            raise EnvPoolError("the environment pool is closed: make a new one")
+            raise EnvPoolError("the environment pool is closed: create a new one")
         try:
             yield
         except BaseException:

@@ -1,4 +1,4 @@
-"""What an environment worker runs: some slots of an `EnvPool`, stepped on request, and how it talks.
+"""The program of an environment worker, which steps some slots of an `EnvPool` on request, and its protocol.
 
 Imports neither torch nor Lightning, so a worker starts in about a second and stays small.
 """
@@ -24,12 +24,11 @@ _HEADER = struct.Struct("<cQ")
 
 
 def record_dtype(task: Task) -> np.dtype[Any]:
-    """One slot's answer to one step.
+    """Return the type of a slot's answer to one step.
 
     Fields: `observation` (O,) to act on next; `reached` (O,) where the action led (they differ when an
-    episode ended and the next began); `position` and `reached_position` (2,) likewise, NaN where there is no
-    maze; `reward`, `terminated`, `truncated`; `success` of the state reached; `alive`, whether there is more
-    to act on.
+    episode ended and the next began); `position` and `reached_position` (2,) likewise, NaN without a maze;
+    `reward`, `terminated`, `truncated`; `success` of the state reached; `alive`, whether the slot has more steps.
     """
     width = (task.observation_dim,)
     return np.dtype(
@@ -48,7 +47,7 @@ def record_dtype(task: Task) -> np.dtype[Any]:
 
 
 class Slots:
-    """Some environments and the seeds each has still to play; runs in a worker, or in the caller itself."""
+    """Some environments and the seeds that each has yet to play; runs in a worker, or in the caller itself."""
 
     def __init__(self, task: Task, count: int) -> None:
         """Build `count` environments."""
@@ -58,15 +57,15 @@ class Slots:
         self.seeds: list[list[int]] = [[] for _ in self.envs]
 
     def start(self, seeds: list[list[int]]) -> NDArray[Any]:
-        """Give every slot its list of seeds and begin the first episodes; a record a slot."""
-        self.seeds = [list(reversed(own)) for own in seeds]
+        """Give every slot its list of seeds and start the first episodes; returns one record per slot."""
+        self.seeds = [list(reversed(each)) for each in seeds]
         records = np.zeros(len(self.envs), self.dtype)
         for slot, record in enumerate(records):
             self._begin(slot, record)
         return records
 
     def step(self, slots: NDArray[np.int64], actions: NDArray[np.float32]) -> NDArray[Any]:
-        """Step some slots; a record each."""
+        """Step some slots; returns one record for each."""
         records = np.zeros(len(slots), self.dtype)
         for slot, action, record in zip(slots.tolist(), actions, records, strict=True):
             observation, reward, terminated, truncated, info = self.envs[slot].step(action)
@@ -95,7 +94,7 @@ class Slots:
 
 @contextlib.contextmanager
 def _small_textures() -> Iterator[None]:
-    """Build MuJoCo models with one-pixel textures: nobody looks through a pool's environments.
+    """Build MuJoCo models with one-pixel textures: a pool's environments are never rendered.
 
     Drawing the mazes' sky is 97 % of the 70 ms that a model takes to compile. Physics is the same to the bit.
     """
@@ -129,7 +128,7 @@ def write_frame(stream: IO[bytes], kind: bytes, payload: bytes) -> None:
 
 
 def read_frame(stream: IO[bytes]) -> tuple[bytes, bytes] | None:
-    """The next frame, or None when the other side has gone."""
+    """Return the next frame, or None if the other side has closed the pipe."""
     header = stream.read(_HEADER.size)
     if len(header) < _HEADER.size:
         return None
@@ -151,8 +150,8 @@ def unpack_step(payload: bytes, action_dim: int) -> tuple[NDArray[np.int64], NDA
 
 
 def worker_main() -> None:
-    """What a worker process runs until its input ends."""
-    # Ctrl-C reaches the whole terminal: the caller decides, and its end is ours.
+    """Run a worker process until its input ends."""
+    # Ctrl-C reaches the whole terminal: the caller decides, and the worker ends with it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     source = os.fdopen(os.dup(0), "rb")
     sink = os.fdopen(os.dup(1), "wb")
@@ -162,7 +161,7 @@ def worker_main() -> None:
         kind, payload = frame
         try:
             if kind == b"I":
-                task, count = pickle.loads(payload)  # noqa: S301 - our own caller's, through a private pipe
+                task, count = pickle.loads(payload)  # noqa: S301 - from our caller, through a private pipe
                 slots = Slots(task, count)
                 answer = b""
             else:
@@ -177,4 +176,4 @@ def worker_main() -> None:
         try:
             write_frame(sink, reply, answer)
         except OSError:
-            break  # the caller has gone
+            break  # the caller has ended

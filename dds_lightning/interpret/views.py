@@ -1,6 +1,6 @@
-"""One row a robot: how it is drawn, and in which units and words its movement is told.
+"""One row per robot: how it is drawn, and in which units and terms its movement is described.
 
-A new robot is one row here beside its row in `tasks.bodies`; a robot without a row is drawn from the side, as a body of
+A new robot needs a row here and one in `tasks.bodies`; a robot without a row is drawn from the side, as a body of
 limbs.
 """
 
@@ -17,20 +17,20 @@ class View:
     """How a robot is drawn.
 
     Attributes:
-        axes: Which of x, y, z run to the right and up in a stick figure.
+        axes: Which of x, y, z point right and up in a stick figure.
         ground: Whether the ground is the line z = 0.
         limbs: Whether there is more to draw than a point.
-        held: Seconds that a skill is held to see what it does; whole skills are played.
-        bodies: Bodies between the first and the last of a stroboscopic picture.
+        held: Seconds that a skill is held to see what it does, rounded to whole skills.
+        bodies: Number of bodies between the first and the last of a stroboscopic picture.
         camera: MuJoCo's camera: distance in metres, azimuth and elevation in degrees.
         looks_at: Where the camera looks; None follows the body at the height `eye`.
-        eye: Height in metres.
+        eye: Height of the camera's target in metres.
         path: Names of the coordinates of a replayed path, see `measure.body.root_path`.
         hand: Whether the path is that of the robot's hand, in three dimensions.
-        units: Of displacement and of speed.
-        mover: What moves, in a sentence.
+        units: Units of displacement and of speed.
+        mover: What moves, for use in a sentence.
         turn: Heading of the column of turns.
-        turns: What it means, in a sentence.
+        turns: What that column means, for use in a sentence.
     """
 
     axes: tuple[int, int] = (0, 2)
@@ -46,11 +46,11 @@ class View:
     units: tuple[str, str] = ("m", "m/s")
     mover: str = "the body"
     turn: str = "turn"
-    turns: str = "it turns from the first half's way to the second's, left is positive"
+    turns: str = "it turns between the directions of the two halves, left is positive"
 
     @property
     def labels(self) -> tuple[str, str]:
-        """Of the two axes of a stick figure."""
+        """Labels of the two axes of a stick figure."""
         right, up = ("xyz"[axis] for axis in self.axes)
         return f"{right} (m)", f"{up} (m)"
 
@@ -85,5 +85,5 @@ VIEWS = {
 
 
 def view_of(task: Task) -> View:
-    """How a task's robot is drawn."""
+    """Return how a task's robot is drawn."""
     return VIEWS.get(body_name(task), View())

@@ -55,10 +55,10 @@ def _report(run: Run) -> Report:
     text: list[Any] = []
     shown = done
     if "report" in run.done:
-        from dds_lightning.study.report import told
+        from dds_lightning.study.report import summary_lines
 
         data |= run.facts("report")
-        text += told(run.facts("report"))
+        text += summary_lines(run.facts("report"))
         shown = [run.done["report"]]
         text.append(f"agent: {run.output('evaluate', 'agent')}")
     text += [f"{name}: {path}" for step in shown for name, path in step.outputs.items()]

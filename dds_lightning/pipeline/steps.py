@@ -181,7 +181,7 @@ def _evaluate(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
 
     agent = agent_of("checkpoint")
     best = agent_of("best") if chosen else None
-    players = contestants.final_table(
+    players = contestants.final_contestants(
         agent,
         task,
         run.episodes,

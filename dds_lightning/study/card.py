@@ -28,11 +28,11 @@ def agent_card(
 
     Args:
         task: Where the agent acts.
-        episodes: The rollout's table; its first contestant is how the agent acts by default.
+        episodes: The rollout's table; its first contestant is the agent as it acts by default.
         seed: Seed of training and evaluation.
         data: Facts about the data, name to value; "source" is where they come from, as `--data` takes it, or a
             sentence that begins with "collected" if they were collected for this agent.
-        settings: "skill" and "policy" to the parsed settings of their training.
+        settings: "skill" and "policy" -> the parsed settings of their training.
         command: The command that trains the same agent again.
     """
     table = summary_table(episodes)
@@ -105,20 +105,19 @@ def _paper(task: Task) -> str:
 
 
 def _limits(task: Task) -> str:
-    """Return what the agent was never trained for."""
+    """Return what the agent was not trained for."""
     if task.maze_map is not None:
         return (
-            "It knows one maze, one start and one goal: another goal needs a policy of its own (the skills can be used "
-            "again)."
+            "It knows one maze, one start and one goal: another goal needs another policy (the skills can be reused)."
         )
     if task.subtasks:
         return (
-            f"It knows one kitchen and {len(task.subtasks)} subtasks ({', '.join(task.subtasks)}): others need a "
-            "policy of their own (the skills can be used again)."
+            f"It knows one kitchen and {len(task.subtasks)} subtasks ({', '.join(task.subtasks)}): others need "
+            "another policy (the skills can be reused)."
         )
     return (
-        "It knows one body in one physics and moves as its data do: another body or another aim needs data and "
-        "training of its own."
+        "It knows one body in one physics and moves as its data do: another body or another aim needs other data and "
+        "another training."
     )
 
 
@@ -132,8 +131,8 @@ def _provenance(source: str, task: Task) -> str:
             f"mind the environment that they were played in, {task.env_id}."
         )
     return (
-        f"The data were given by whoever trained it ({source}): compare scores only with others on the same data, and "
-        "not with those on D4RL's data sets."
+        f"The data were provided by the user who trained it ({source}): compare scores only with others on the same "
+        "data, and not with those on D4RL's data sets."
     )
 
 

@@ -1,4 +1,4 @@
-"""Who plays in the final table: one agent whose skills are chosen in several ways, and its baselines."""
+"""The contestants of the final table: one agent whose skills are chosen in several ways, and its baselines."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -29,12 +29,12 @@ def way_name(selection: str, temperature: float = 1.0) -> str:
 def way(
     agent: "DDSAgent", selection: str, episodes: int, temperature: float = 1.0, best: Mapping[str, Any] | None = None
 ) -> Contestant:
-    """One way of choosing skills as a contestant.
+    """Return one way of choosing skills as a contestant.
 
     Args:
         agent: The agent whose skills and policy play.
-        selection: As in `DDSAgent`.
-        episodes: How many it plays.
+        selection: How skills are chosen, see `DDSAgent`.
+        episodes: Number of episodes to play.
         temperature: Temperature of `sample`.
         best: Facts of the checkpoint (see `protocol.best_facts`), if it is not the last one; its name says so.
     """
@@ -54,7 +54,7 @@ def best_label(best: Mapping[str, Any]) -> str:
     return f"best of {best['evaluations']} evaluations while training, step {best['step']:,}: optimistic"
 
 
-def final_table(
+def final_contestants(
     agent: "DDSAgent",
     task: Task,
     episodes: int,
@@ -67,12 +67,12 @@ def final_table(
 
     Args:
         agent: The trained agent; its selection and temperature make the table's first row.
-        task: Where they play.
+        task: The task that they play.
         episodes: Episodes of each contestant.
         episodes_per_skill: Episodes of each single skill alone.
         clone: Actor of the behaviour-cloning baseline, if there is one.
         controller: Actor that collected the data, if there is one.
-        best: Ways of choosing of the best checkpoint, if one was kept.
+        best: The best checkpoint's contestants, if one was kept.
     """
     ways = [
         (agent.selection, agent.temperature),
@@ -91,7 +91,7 @@ def final_table(
 
 
 def behaviour_controller(task: Task) -> Any:
-    """The actor that made a collected set, with the noise that it had there; None if there is no collector."""
+    """Return the actor that collected a data set, with the same noise; None if there is no collector."""
     from datamodules.collect.collectors import behaviour_actor
 
     return behaviour_actor(task)

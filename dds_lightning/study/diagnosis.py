@@ -1,9 +1,9 @@
 """Where a run loses: what the data hold, what a copy of them reaches, one skill alone, and the choice of skills.
 
 ```
- data ──► behaviour cloning        what actions alone give
-   └────► skills ──► one skill     what the decoder gives
-             └─────► policy        what choosing adds
+ data ──► behaviour cloning        score of imitating actions alone
+   └────► skills ──► one skill     score of the decoder
+             └─────► policy        gain from choosing skills
 ```
 """
 
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 def behaviour_scores(trajectories: Trajectories, task: Task) -> dict[str, float]:
     """Score the behaviour policy as an evaluation would.
 
-    In the kitchen the data's rewards count at every step, an evaluation only once: there the subtasks that an
-    episode completes are counted.
+    In the kitchen the data give rewards at every step, an evaluation only once, so the subtasks that an episode
+    completes are counted instead.
 
     Returns:
         `mean` and `best` normalised score of an episode.
@@ -43,11 +43,11 @@ def behaviour_scores(trajectories: Trajectories, task: Task) -> dict[str, float]
 
 
 def diagnose(findings: Findings, logs: Mapping[str, Path]) -> dict[str, pd.DataFrame]:
-    """Return the small tables of the report's section on where the run loses; what was not measured is left out.
+    """Return the tables of the report's section on where the run loses; what was not measured is left out.
 
     Args:
         findings: What the run produced.
-        logs: "skill" and "policy" to the metrics.csv of their training.
+        logs: "skill" and "policy" -> the metrics.csv of their training.
 
     Returns:
         `scores`: one row per step from data to policy, columns `who` and `score` (normalised); `measures`: columns

@@ -32,10 +32,10 @@ def evaluate(
 ) -> Report:
     """Roll out a trained agent; arguments and JSON keys are those of `dds evaluate`.
 
-    The report's `protocol` is the last checkpoint's where both play; if the best one's differs, a line says how.
+    If both checkpoints play, the report's `protocol` is that of the last one; a line says how the best one's differs.
 
     Raises:
-        UserError: There is no agent, or none of the requested checkpoint, for the task or with such a selection.
+        UserError: There is no agent or no such checkpoint, or it does not fit the task or the selection.
     """
     places = _places(directory, checkpoint)
     first = next(iter(places.values()))
@@ -75,11 +75,11 @@ def evaluate(
 
 
 def _places(directory: Path, checkpoint: str) -> dict[str, Path]:
-    """The published directories to play, by checkpoint."""
+    """Return the published directories to play, by checkpoint."""
     last: Path | None = agent_directory(directory)
     best = best_directory(directory)
     if last == directory and isinstance(load_published(directory).config.get("checkpoint"), dict):
-        last, best = None, directory  # what a run published as its best
+        last, best = None, directory  # a run published this as its best
     places = {kind: place for kind, place in ((LAST, last), (BEST, best)) if place is not None}
     if checkpoint == "both":
         return places

@@ -25,7 +25,7 @@ class Findings:
 
     Attributes:
         root: The run directory.
-        task: What was played.
+        task: The task that was played.
         result: The evaluation's episodes and paths.
         main: The contestant the run is about: the published agent as it acts by default.
         singles: The contestant whose parts are the single skills; None if they did not play.
@@ -50,12 +50,13 @@ class Findings:
         """Read a run directory.
 
         Raises:
-            UserError: The directory holds no evaluation, one of an unknown task, or a stage of a newer version.
+            UserError: The directory holds no evaluation, its task is unknown, or a stage was written by a newer
+                version.
         """
         if not (root / "evaluate" / "episodes.parquet").is_file():
             raise UserError(
-                f"{root} holds no evaluation (evaluate/episodes.parquet): expected a directory that `dds run` "
-                "has brought at least as far as its stage 'evaluate'"
+                f"{root} holds no evaluation (evaluate/episodes.parquet): expected a run of `dds run` that has "
+                "finished at least its stage 'evaluate'"
             )
         recall_task(root)
         result = RolloutResult.load(root / "evaluate")
@@ -89,5 +90,5 @@ class Findings:
 
     @property
     def protocol(self) -> Mapping[str, Any] | None:
-        """How the evaluation was done, see `protocol.protocol`; None where an older version did it."""
+        """How the evaluation was done, see `protocol.protocol`; None if an older version did it."""
         return self.facts("evaluate").get("protocol")

@@ -16,11 +16,11 @@ _OTHERS = 3
 
 
 def page(findings: Findings, files: Mapping[str, str], diagnosis: Mapping[str, pd.DataFrame]) -> str:
-    """The report as Markdown.
+    """Return the report as Markdown.
 
     Args:
-        findings: What it shows.
-        files: Name -> file beside it, of those that exist.
+        findings: The results that it shows.
+        files: Name -> file beside the report, for those that exist.
         diagnosis: The tables of `diagnosis.diagnose`.
     """
     parts = [f"# {findings.task.name}", _opening(findings), _results(findings)]
@@ -38,8 +38,8 @@ def page(findings: Findings, files: Mapping[str, str], diagnosis: Mapping[str, p
     if "values" in files:
         parts.append("## What the critic believes\n")
         text = (
-            "V for a body at rest. Along the way to the goal it should rise steadily; a dead end that looks "
-            "better than the way out of it is where a policy gets stuck."
+            "V for a body at rest. Along the way to the goal it should rise steadily; a policy gets stuck "
+            "in a dead end that looks better than the way out of it."
         )
         parts.append(_picture(files, "values", text))
     if "training" in files:
@@ -115,11 +115,15 @@ def _skills(findings: Findings, files: Mapping[str, str]) -> str:
     shown = markdown(table.rename(columns=headings), {headings.get(k, k): v for k, v in formats.items()})
     text = "## The skills\n\n"
     if "starts_by_skill" in files:
-        text += _picture(files, "starts_by_skill", "Each skill alone from several starts, one panel a skill.") + "\n\n"
+        text += (
+            _picture(files, "starts_by_skill", "Each skill alone from several starts, one panel per skill.") + "\n\n"
+        )
     if "skills_by_start" in files:
-        text += _picture(files, "skills_by_start", "The same from near; a number is where its skill ended.") + "\n\n"
+        text += (
+            _picture(files, "skills_by_start", "The same in close-up; a number marks where its skill ended.") + "\n\n"
+        )
     if "single_skills" in files:
-        text += _picture(files, "single_skills", "Each skill alone from the task's own start.") + "\n\n"
+        text += _picture(files, "single_skills", "Each skill alone from the task's start.") + "\n\n"
     text += shown + f"\n\nChosen: share of the decisions of {findings.main}."
     if "dx" in table:
         text += " dx, dy and distance: mean change of the first two observations over a segment of the data."
@@ -129,7 +133,7 @@ def _skills(findings: Findings, files: Mapping[str, str]) -> str:
 
 
 def diagnosis_section(tables: Mapping[str, pd.DataFrame]) -> str:
-    """The section on where a run loses, from the tables of `diagnosis.diagnose`."""
+    """Return the section on where a run loses, from the tables of `diagnosis.diagnose`."""
     text = (
         "## Where it loses\n\nFrom what the data hold, by what a copy of their actions and one skill alone reach, to "
         "what choosing skills reaches.\n\n" + markdown(tables["scores"], {"score": ".1f"})

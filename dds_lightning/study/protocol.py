@@ -38,13 +38,13 @@ def protocol(
         seed: Seed of environments and agents.
         temperature: Temperature of sampled codes.
         checkpoint: "last", "best" or "last and best".
-        best: Facts of the best checkpoint, see `best_facts`, where it plays too.
+        best: Facts of the best checkpoint, see `best_facts`, if it plays too.
 
     Returns:
         Plain values: `task` (with its variant), `environment`, `episodes`, `seed`, `checkpoint`, `noise_scale`
         (factor on the decoder's noise), `sampler` (of the decoder; None for one without noise), `temperature`,
         `horizon` (steps of a skill), `max_episode_steps`, `score_min` and `score_max` (returns that score 0
-        and 100), `paper_score` (None where the paper has none), `best` (None without).
+        and 100), `paper_score` (None if the paper has none), `best` (None without one).
     """
     settings = agent.skill.hparams
     return {
@@ -66,7 +66,7 @@ def protocol(
 
 
 def full_name(task: Task) -> str:
-    """Return a task's name with its variant, as it can be typed."""
+    """Return a task's name with its variant, as accepted by `get_task`."""
     return f"{task.base_name}@{task.physics}" if task.physics else task.name
 
 
@@ -83,7 +83,7 @@ def heading(facts: Mapping[str, Any]) -> str:
 
 
 def paper_line(task: Task) -> str | None:
-    """Return what the paper reports for a task and why it may not be comparable; None where it reports nothing."""
+    """Return what the paper reports for a task and why it may not be comparable; None if it reports nothing."""
     return None if task.paper_score is None else f"The paper reports {task.paper_score:.1f}, {PAPERS_DATA}."
 
 
@@ -91,8 +91,8 @@ def best_facts(last: Path, best: Path) -> dict[str, Any]:
     """Return how a training chose its best checkpoint, read from its two files.
 
     Args:
-        last: The training's last checkpoint; it has the history of all evaluations.
-        best: The checkpoint that was kept.
+        last: The training's last checkpoint, which has the history of all evaluations.
+        best: The best checkpoint that was kept.
 
     Returns:
         `monitor` (name of the metric), `value`, `step` and `evaluations`, how many of them the best was chosen from
@@ -120,11 +120,11 @@ def best_facts(last: Path, best: Path) -> dict[str, Any]:
 
 
 def start_value(task: Task, agent: DDSAgent, seed: int, episodes: int = 10) -> dict[str, float] | None:
-    """Return the critic's value where episodes start, in discounted learning rewards.
+    """Return the critic's value at the starts of episodes, in discounted learning rewards.
 
     Returns:
-        `mean` of V over the starts of some evaluation episodes, and `low` and `high`, what rewards and discounts
-        of the data allow at all; None for an agent without a policy.
+        `mean` of V over the starts of some evaluation episodes, and `low` and `high`, its bounds given the rewards and
+        discounts of the data; None for an agent without a policy.
     """
     import torch
 

@@ -6,7 +6,7 @@
  skill/logs  policy/logs  */stage.json ┘
 ```
 
-Nothing is taken from memory, so `report(directory)` always draws the same.
+Everything is read from files, so `report(directory)` always draws the same.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ def write_report(run_dir: str | Path) -> dict[str, Any]:
     """Write `report/` of a run directory; every file whole or not at all.
 
     Args:
-        run_dir: A directory of `dds run`, evaluated.
+        run_dir: A directory of `dds run` with an evaluation.
 
     Returns:
-        Paths of the files by name, and the facts that `told` prints, as plain JSON values: `task`, `main` (the
-        contestant that the run is about), `protocol` (see `protocol.protocol`; None of an older run), `table`
+        Paths of the files by name, and the facts that `summary_lines` prints, as plain JSON values: `task`, `main` (the
+        contestant that the run is about), `protocol` (see `protocol.protocol`; None for an older run), `table`
         (see `tables.summary_table`), `failures` (of the main contestant; see `tables.failures_table`) and
         `diagnosis` (see `diagnosis.diagnose`).
 
@@ -87,16 +87,16 @@ def report(run_dir: str | Path) -> Report:
     """Write the report of a run directory again, and return what is in it.
 
     Raises:
-        UserError: As `write_report`.
+        UserError: See `write_report`.
     """
     from dds_lightning.console.reports import Report
 
     written = write_report(run_dir)
     paths = [f"{name}: {path}" for name, path in written.items() if isinstance(path, Path)]
-    return Report(written, [*told(written), *paths])
+    return Report(written, [*summary_lines(written), *paths])
 
 
-def told(facts: Mapping[str, Any]) -> list[RenderableType]:
+def summary_lines(facts: Mapping[str, Any]) -> list[RenderableType]:
     """Format the facts of `write_report` for a terminal: the table, and where the main contestant's failures ended."""
     from dds_lightning.console.reports import table
 
@@ -126,7 +126,7 @@ def _draw(findings: Findings, folder: Path, logs: Mapping[str, Path]) -> dict[st
     def keep(name: str, figure: Any) -> None:
         written[name] = folder / f"{name}.png"
         with written_whole(written[name]) as part:
-            # Without matplotlib's version in it, the same picture is the same file.
+            # Without matplotlib's version in the metadata, the same picture gives the same bytes.
             figure.savefig(part, format="png", dpi=DPI, metadata={"Software": None})
 
     if findings.task.maze_map is not None:
@@ -161,7 +161,7 @@ def _draw_maze(findings: Findings, folder: Path, keep: Any, written: dict[str, P
 
 
 def _value_map(findings: Findings, directory: Path) -> Any:
-    """The published critic over the maze, with the policy's likeliest codes and where the data say they lead."""
+    """Draw the published critic over the maze, with the likeliest codes and where they lead according to the data."""
     import numpy as np
 
     from dds_lightning.agent import DDSAgent
@@ -177,9 +177,9 @@ def _value_map(findings: Findings, directory: Path) -> Any:
 
 
 def _metrics(root: Path, stage: str, folder: Path) -> Path | None:
-    """Merge the metrics of a training that may have been interrupted: each launch logged to a file of its own.
+    """Merge the metrics of a training that may have been interrupted: each launch logged to a separate file.
 
-    What a launch logged after the step from which the next one resumed was lost, and is left out.
+    What a launch logged after the step from which the next one resumed is left out.
     """
     folders = sorted((root / stage / "logs").glob("version_*"), key=lambda path: int(path.name.split("_")[1]))
     launches: list[pd.DataFrame] = []

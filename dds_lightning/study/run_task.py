@@ -1,4 +1,4 @@
-"""The task of a run directory, which keeps the definition of one that the table does not have."""
+"""The task of a run directory, which stores the definition of a custom task."""
 
 from pathlib import Path
 
@@ -13,17 +13,17 @@ TASK_FILE = "task.yaml"
 
 
 def keep_task(run: Path, task: Task) -> None:
-    """Write the definition of a task of one's own into a run directory; nothing for a task of the table."""
+    """Write the definition of a custom task into a run directory; does nothing for a task of the table."""
     if is_own(task):
         with written_whole(run / TASK_FILE) as part:
             part.write_text(yaml.safe_dump(definition(task), sort_keys=False), encoding="utf-8")
 
 
 def recall_task(run: Path) -> None:
-    """Let the task that a run directory keeps be found by its name; nothing where it keeps none.
+    """Register the custom task of a run directory, so that it is found by name; does nothing if there is none.
 
     Raises:
-        UserError: The file is not a task's.
+        UserError: The file does not define a task.
     """
     path = run / TASK_FILE
     if not path.is_file():

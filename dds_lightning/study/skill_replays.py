@@ -22,16 +22,16 @@ Arrays = dict[str, NDArray[np.generic]]
 
 
 def replay_skills(task: Task, agent: DDSAgent, steps: int = 50, seed: int = 0) -> Arrays:
-    """Play every skill alone from every junction, the body at rest.
+    """Play every skill alone from every junction, starting with the body at rest.
 
     Args:
         task: A maze.
         agent: The agent whose decoder acts; its policy is not used.
-        steps: T of each replay, if it does not reach the goal before.
+        steps: T of each replay, unless it reaches the goal earlier.
         seed: Seed of the decoder's noise.
 
     Returns:
-        `starts` (N, 2) where the body was set down, the same for all skills of a cell, `positions`
+        `starts` (N, 2) where the body starts, the same for all skills of a cell, `positions`
         (N, T + 1, 2) metres, `codes` (N,), `alive` (N, T), with N = cells x K.
     """
     states = rest_states(task, junctions(task))
@@ -41,7 +41,7 @@ def replay_skills(task: Task, agent: DDSAgent, steps: int = 50, seed: int = 0) -
 
 
 def stored_replays(path: Path, task: Task, directory: Path) -> Arrays:
-    """Read the replays in `path`; first create them there unless they are of this agent already.
+    """Read the replays in `path`, after creating them there unless they already belong to this agent.
 
     Args:
         path: The `.npz` file.

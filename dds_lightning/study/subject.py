@@ -11,7 +11,7 @@ from dds_lightning.agent import DDSAgent
 from dds_lightning.errors import UserError
 from dds_lightning.interpret.atlas.build import CONTINUOUS, DISCRETE, Atlas, make_atlas
 from dds_lightning.interpret.atlas.page import write_atlas, write_pictures
-from dds_lightning.interpret.atlas.pictures import Tell
+from dds_lightning.interpret.atlas.pictures import Announce
 from dds_lightning.rollout.actors import single_skills
 from dds_lightning.rollout.play import rollout
 from dds_lightning.rollout.result import RolloutResult
@@ -32,10 +32,10 @@ class Subject:
 
     Attributes:
         agent: Its skills, and its policy if there is one.
-        task: Name of the task; None where nothing says it.
-        data: Where the data are, `SOURCE:NAME`; None where nothing says it.
-        found: The evaluation of a finished run; None elsewhere.
-        about: A description.
+        task: Name of the task; None if unknown.
+        data: Where the data are, `SOURCE:NAME`; None if unknown.
+        found: The evaluation of a finished run; None for anything else.
+        about: Description of the checkpoint.
     """
 
     agent: DDSAgent
@@ -46,10 +46,10 @@ class Subject:
 
 
 def find_subject(place: Path, seed: int = 0) -> Subject:
-    """Find out what a path holds.
+    """Determine what a path holds.
 
     Args:
-        place: A run of `dds run` that has learnt its skills at least, a published directory, or a skill checkpoint.
+        place: A run of `dds run` with at least its skills trained, a published directory, or a skill checkpoint.
         seed: Seed of the agent.
 
     Raises:
@@ -66,7 +66,7 @@ def find_subject(place: Path, seed: int = 0) -> Subject:
                 _skills_alone(checkpoint, seed), task, data, None, f"skills of the run {place}, no policy yet"
             )
         if data is not None:
-            raise UserError(f"{place} is a run that has not learnt its skills yet: let `dds run` finish them")
+            raise UserError(f"{place} is a run whose skills are not trained yet: finish them with `dds run`")
     directory = agent_directory(place)
     from dds_lightning.saving.published import load_published
 
@@ -83,7 +83,7 @@ def _skills_alone(checkpoint: Path, seed: int) -> DDSAgent:
 
 
 def _data_of(run: Path) -> tuple[str | None, str | None]:
-    """Return data and task of a run; None for what is not a run."""
+    """Return data and task of a run; both None if it is not a run."""
     marker = read_marker(run / "data")
     settings = marker.get("settings", {})
     collected = marker.get("outputs", {}).get("data")
@@ -99,37 +99,39 @@ def atlas(
     against: Sequence[Path] = (),
     seed: int = 0,
     figures: Path | None = None,
-    tell: Tell = lambda words: None,
+    announce: Announce = lambda message: None,
 ) -> tuple[Atlas, Path]:
     """Create and write the atlas of a path; the arguments are those of `dds atlas`.
 
     Raises:
-        UserError: No skills there, no data or no task known, or they do not fit each other.
-        DataError: Data that are damaged or another task's.
+        UserError: There are no skills, the data or the task is unknown, or they do not fit each other.
+        DataError: The data are damaged or belong to another task.
     """
     from datamodules.relabel import check_widths
     from datamodules.sources import load_trajectories
 
-    tell("looking at the checkpoint")
+    announce("looking at the checkpoint")
     subject = find_subject(place, seed)
     spec, name = data or subject.data, task or subject.task
     if spec is None:
         raise UserError(f"{place} does not know its data: give --data, for example local:DIR, minari:ID or d4rl:FILE")
     if name is None:
         raise UserError(f"{place} does not say which task it is for: give --task; `dds tasks` lists them")
-    known = get_task(task) if task else known_task(name)  # a name from a file never opens another
+    known = get_task(task) if task else known_task(name)  # a name read from a file never opens another file
     models = [SkillModule.load(path) for path in against]
-    tell("reading the data")
+    announce("reading the data")
     trajectories = load_trajectories(spec, known)
     wanted = trajectories.task
     assert wanted is not None
     for model in (subject.agent.skill, *models):
         check_widths(trajectories, model)
-    result, main, singles = _episodes(subject, wanted, episodes, seed, tell)
+    result, main, singles = _episodes(subject, wanted, episodes, seed, announce)
     others = [(DISCRETE if model.discrete else CONTINUOUS, model) for model in models]
-    made = make_atlas(subject.agent, wanted, trajectories, result, main, singles, others=others, seed=seed, tell=tell)
+    made = make_atlas(
+        subject.agent, wanted, trajectories, result, main, singles, others=others, seed=seed, announce=announce
+    )
     command = ["dds", "atlas", str(place), "--data", spec, "--task", wanted.name, "--seed", str(seed)]
-    tell("writing the page")
+    announce("writing the page")
     if figures is not None:
         write_pictures(made, figures, out.stem)
     about = _about(subject, wanted, spec, result, main)
@@ -137,7 +139,7 @@ def atlas(
 
 
 def _episodes(
-    subject: Subject, task: Task, episodes: int, seed: int, tell: Tell
+    subject: Subject, task: Task, episodes: int, seed: int, announce: Announce
 ) -> tuple[RolloutResult | None, str | None, str | None]:
     """Return episodes with their paths, and the names of policy and single skills: the run's, or played now."""
     found = subject.found
@@ -150,8 +152,8 @@ def _episodes(
     if agent.policy is not None:
         players.insert(0, way(agent, agent.selection, max(episodes, 1), agent.temperature))
         main = players[0].name
-    tell(f"playing {sum(player.episodes for player in players)} episodes")
-    seen = task.maze_map is None  # where there is no way over a maze to draw
+    announce(f"playing {sum(player.episodes for player in players)} episodes")
+    seen = task.maze_map is None  # without a maze there are no paths to draw
     result = rollout(task, players, seed=seed, progress=False, record=True, record_observations=seen)
     return result, main, SINGLE
 

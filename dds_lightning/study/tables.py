@@ -1,4 +1,4 @@
-"""From one row per episode to the tables of a report: pure functions of tables."""
+"""The tables of a report, computed from one row per episode by pure functions."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ SKILL, BEST, CONTESTANT = "skill", "best", "contestant"
 
 
 def wilson(successes: int, episodes: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Wilson's score interval of a success rate (Wilson, 1927), sound also at 0 and at all successes.
+    """Return Wilson's score interval of a success rate (Wilson, 1927), also valid at 0 % and 100 %.
 
     Args:
-        successes: How many.
-        episodes: Out of how many.
+        successes: Number of successful episodes.
+        episodes: Number of episodes.
         confidence: Coverage, for example 0.95.
 
     Returns:
@@ -33,21 +33,21 @@ def wilson(successes: int, episodes: int, confidence: float = 0.95) -> tuple[flo
     denominator = 1.0 + z**2 / episodes
     centre = rate + z**2 / (2 * episodes)
     spread = z * math.sqrt(rate * (1.0 - rate) / episodes + z**2 / (4 * episodes**2))
-    # At the ends the bound is exactly 0 or 1; rounding must not say otherwise.
+    # At the ends the bound is exactly 0 or 1, whatever rounding gives.
     low = 0.0 if successes == 0 else (centre - spread) / denominator
     high = 1.0 if successes == episodes else (centre + spread) / denominator
     return low, high
 
 
 def summary_table(episodes: pd.DataFrame) -> pd.DataFrame:
-    """One row per contestant; below a contestant of several parts, the best part and each part.
+    """Return one row per contestant; below a contestant of several parts, the best part and each part.
 
     Args:
-        episodes: As in `RolloutResult.episodes`.
+        episodes: Table of episodes, see `RolloutResult.episodes`.
 
     Returns:
         Columns `contestant` (its name says how codes are chosen), `kind` ("contestant", "best" or "skill"),
-        `episodes`, `success` with `success_low` and `success_high` (per cent; Wilson, 95 %; NaN where the task
+        `episodes`, `success` with `success_low` and `success_high` (per cent; Wilson, 95 %; NaN if the task
         does not measure success), `score` (mean, normalised) with `score_error` (its standard error), `return`
         (mean), `steps` (mean of all episodes), `length` (median steps of successful episodes).
     """
@@ -90,25 +90,25 @@ def _row(name: str, kind: str, played: pd.DataFrame) -> dict[str, Any]:
 
 
 def _succeeded(episodes: pd.DataFrame) -> pd.Series | None:
-    """Which episodes succeeded, as plain bools; None where the task does not measure success."""
+    """Return which episodes succeeded, as plain bools; None if the task does not measure success."""
     return None if episodes["success"].isna().any() else episodes["success"].astype(bool)
 
 
 def _rank(row: Mapping[str, Any]) -> tuple[float, float, float]:
-    """Orders parts: score, then success (in mazes the same), then the shorter way."""
+    """Return the sort key of parts: score, then success (in mazes the same), then the shorter path."""
     success, length = row["success"], row["length"]
     return row["score"], 0.0 if math.isnan(success) else success, -math.inf if math.isnan(length) else -length
 
 
 def failures_table(episodes: pd.DataFrame, task: Task) -> pd.DataFrame:
-    """Where failed episodes ended and with which skill, the most frequent end first; empty where nothing can fail.
+    """Return where failed episodes ended and with which skill, most frequent first; empty if nothing can fail.
 
     Args:
-        episodes: As in `RolloutResult.episodes`.
-        task: Says which cell a position is in.
+        episodes: Table of episodes, see `RolloutResult.episodes`.
+        task: The task, which maps positions to cells.
 
     Returns:
-        Columns `contestant`, `row` and `column` of the end cell (missing where there is no maze), `skill` in
+        Columns `contestant`, `row` and `column` of the end cell (missing without a maze), `skill` in
         use (-1 without skills), `episodes`, `share` (of the contestant's failures).
     """
     succeeded = _succeeded(episodes)
@@ -145,17 +145,17 @@ def skills_table(
     alone: pd.DataFrame | None,
     effects: Sequence[str] = ("dx", "dy", "distance"),
 ) -> pd.DataFrame:
-    """One row per code: how often the data use it and the policy chooses it, what it does, how it scores alone.
+    """Return one row per code: how often the data use it and the policy chooses it, what it does, its score alone.
 
     Args:
         chosen: The codes of each of the policy's episodes.
         data: Summary of the relabelled data (`relabel/codes.csv`), if there is one.
         alone: Episodes of the single skills (rows of `RolloutResult.episodes`), if they played.
-        effects: Columns of `data` that say what a segment of the code does, in the data's units.
+        effects: Columns of `data` on what a segment with the code does, in the data's units.
 
     Returns:
         Columns `skill`, `in data`, `chosen` (per cent), the effects, `alone` (mean normalised score, in a maze
-        the per cent that reach the goal; or NaN); those without a source are left out.
+        the percentage that reach the goal; or NaN); those without a source are left out.
     """
     codes = np.fromiter((code for episode in chosen for code in episode), dtype=np.int64)
     count = int(codes.max(initial=-1)) + 1
@@ -178,9 +178,9 @@ def skills_table(
 
 
 def readable(summary: pd.DataFrame, task: Task) -> pd.DataFrame:
-    """The summary as it is printed: units in the headings, a mean with its standard error, a rate with its interval.
+    """Return the summary as printed: units in the headings, means with standard errors, rates with intervals.
 
-    In mazes success comes first; elsewhere the normalised score, followed by the return.
+    Success comes first in mazes; otherwise the normalised score, followed by the return.
     """
     skill = summary["kind"] == SKILL
     columns: dict[str, Any] = {
@@ -215,7 +215,7 @@ def readable(summary: pd.DataFrame, task: Task) -> pd.DataFrame:
 
 
 def ends(failures: pd.DataFrame) -> pd.DataFrame:
-    """Failures as they are printed: the cell as one text."""
+    """Return failures as printed: the cell as one text."""
     cells = [
         "-" if pd.isna(row) else f"({row}, {column})"
         for row, column in zip(failures["row"], failures["column"], strict=True)
@@ -233,10 +233,10 @@ def ends(failures: pd.DataFrame) -> pd.DataFrame:
 
 
 def markdown(table: pd.DataFrame, formats: Mapping[str, str] | None = None) -> str:
-    """A DataFrame as a Markdown table: numbers to the right, missing values as a dash.
+    """Format a DataFrame as a Markdown table: numbers right-aligned, missing values as a dash.
 
     Args:
-        table: Small.
+        table: A small table.
         formats: Column -> format of its numbers, for example ".1f".
     """
     formats = formats or {}
@@ -249,7 +249,7 @@ def markdown(table: pd.DataFrame, formats: Mapping[str, str] | None = None) -> s
 
 
 def cell(value: Any, form: str = "") -> str:
-    """One value as text."""
+    """Format one value."""
     if pd.isna(value):
         return "-"
     return format(value, form).replace("|", "\\|") if form else str(value).replace("|", "\\|")

@@ -1,7 +1,7 @@
-"""The table of tasks: which environment, from where to where, how long, and how scores and rewards are read.
+"""The table of tasks: which environment, from where to where, how long, and how scores and rewards are computed.
 
 Facts are rows of `rows.py`; a new task is a new row. Environments are built from this table and nothing else,
-never from what a data set says about itself.
+never from the metadata of a data set.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _TABLE: dict[str, Task] = {task.name: task for task in ROWS}
 _OWN: dict[str, Task] = {}
-"""Tasks of one's own that this process has read."""
+"""Custom tasks that this process has read."""
 
 
 def task_names() -> tuple[str, ...]:
@@ -32,11 +32,11 @@ def task_names() -> tuple[str, ...]:
 
 
 def get_task(name: str | Task) -> Task:
-    """Look a task up.
+    """Look up a task.
 
     Args:
         name: `NAME` or `NAME@VARIANT` of the table, the path of a task file, `package.module:NAME` of a `Task`, or the
-            name of a task of one's own that this process has read before. A `Task` is returned as it is.
+            name of a custom task that this process has read before. A `Task` is returned as it is.
 
     Raises:
         UserError: There is no such task; the message lists the nearest names.
@@ -47,7 +47,7 @@ def get_task(name: str | Task) -> Task:
 
 
 def known_task(name: str) -> Task:
-    """Look up a name that stands in a file: of the table, or read before in this process; nothing is opened or run.
+    """Look up a name found in a file: in the table, or among the tasks read before; nothing is opened or executed.
 
     Raises:
         UserError: There is no such task; the message lists the nearest names.
@@ -62,53 +62,53 @@ def known_task(name: str) -> Task:
 
 
 def remember(task: Task) -> Task:
-    """Let a task of one's own be found by its name in this process.
+    """Register a custom task, so that `get_task` finds it by name in this process.
 
     Raises:
         UserError: The table has a task of that name.
     """
     if task.base_name in _TABLE and task != known_task(task.name):
-        raise UserError(f"task: name is {task.name}, which the table has already; choose another name")
+        raise UserError(f"task: name is {task.name}, which is already in the table; choose another name")
     if task.base_name not in _TABLE:
         _OWN[task.name] = task
     return task
 
 
 def is_own(task: Task) -> bool:
-    """Whether a task is not of the table, so that whoever keeps its name must keep its definition too."""
+    """Whether a task is not in the table, so that its definition has to be stored along with its name."""
     return task.base_name not in _TABLE
 
 
 def restore_task(facts: Mapping[str, Any], where: str | Path) -> Task | None:
-    """The task that an agent or a run was made for.
+    """Return the task that an agent or a run was trained for.
 
     Args:
-        facts: `task`, its name, and `task_definition` where it is not of the table; see `facts_to_keep`.
+        facts: `task`, its name, and `task_definition` if it is not in the table; see `facts_to_keep`.
         where: The file, for messages.
 
     Returns:
-        The task; None where no name is kept.
+        The task; None if no name is stored.
 
     Raises:
-        UserError: There is no such task, or its definition is not one.
+        UserError: There is no such task, or its definition is invalid.
     """
     kept = facts.get("task_definition")
     if kept is not None:
         if not isinstance(kept, Mapping):
-            raise UserError(f"{where}: task_definition is {kept!r}, expected names with values")
+            raise UserError(f"{where}: task_definition is {kept!r}, expected a mapping of names to values")
         return remember(build_task(kept, f"{where}, task_definition", trusted=False))
     return None if facts.get("task") is None else known_task(str(facts["task"]))
 
 
 def facts_to_keep(task: Task) -> dict[str, Any]:
-    """What an agent or a run keeps so that `restore_task` finds its task anywhere."""
+    """Return what an agent or a run has to store so that `restore_task` finds its task anywhere."""
     return {"task": task.name, **({"task_definition": definition(task)} if is_own(task) else {})}
 
 
 def task_for_env(task: Task, env_id: str) -> Task | None:
-    """The variant of a task in which recordings of an environment belong; None where none fits.
+    """Return the variant of a task that recordings from an environment fit; None if no variant does.
 
-    A task whose name says its variant stands for itself alone.
+    If the name of the task includes its variant, no other variant is considered.
     """
     if task.accepts(env_id):
         return task
@@ -124,7 +124,7 @@ def known_env_ids() -> frozenset[str]:
 
 
 def task_table() -> pd.DataFrame:
-    """The table of tasks for people: one row a task; `facts.task_facts` has everything about one."""
+    """Return the table of tasks for people, one row per task; `facts.task_facts` has everything about one."""
     import pandas as pd
 
     return pd.DataFrame(

@@ -1,8 +1,8 @@
-"""One row a robot: what its observations and actions hold, and how they relate to the simulator's state.
+"""One row per robot: what its observations and actions hold, and how they relate to the simulator's state.
 
-A new robot is a row of `BODIES` and, for pictures, one of `interpret.views.VIEWS`; a task's robot is the first word of
-its name, unless it says another. A robot without a row trains and acts all the same; its columns then have no names,
-and what needs the simulator's state is refused.
+A new robot is a row of `BODIES` and, for pictures, one of `interpret.views.VIEWS`; a task's robot is the first part of
+its name, unless `Task.body` says otherwise. A robot without a row trains and acts all the same, but its columns have no
+names, and whatever needs the simulator's state raises an error.
 
 Names of columns follow the joints and motors of the MuJoCo models, in the models' order; a test compares the two.
 """
@@ -30,14 +30,14 @@ class StateLayout(NamedTuple):
     Attributes:
         names: W names with units.
         positions: Columns with qpos, in its order.
-        velocities: Columns with qvel; none where they are not recorded.
-        degrees: Entries of qvel.
-        hidden: Entries of qpos before the recorded ones.
+        velocities: Columns with qvel; empty if they are not recorded.
+        degrees: Number of entries of qvel.
+        hidden: Number of entries of qpos before the recorded ones.
         speed_limit: Recorded velocities are cut to +-this.
-        lead: Steps that a replay begins earlier, so that velocities which had to be estimated are forgotten.
+        lead: How many steps earlier a replay begins, so that estimated initial velocities no longer matter.
         noisy: Whether states were recorded with noise.
-        judged: The first so many columns tell whether a recording fits; None takes all. In the kitchen they are the
-            robot's: pushing an object turns the noise on the robot's position into any error.
+        judged: How many of the first columns decide whether a recording fits; None takes all. In the kitchen they are
+            the robot's: pushing an object turns noise in the robot's position into arbitrary errors.
     """
 
     names: tuple[str, ...]
@@ -51,7 +51,7 @@ class StateLayout(NamedTuple):
     judged: int | None = None
 
     def observe(self, qpos: Floats, qvel: Floats) -> Floats:
-        """The W numbers that a recording holds of a state, without noise."""
+        """Return the W numbers that a recording holds for a state, without noise."""
         seen = np.zeros(len(self.names))
         seen[list(self.positions)] = qpos[self.hidden :]
         seen[list(self.velocities)] = np.clip(qvel, -self.speed_limit, self.speed_limit)[: len(self.velocities)]
@@ -62,8 +62,8 @@ class Part(NamedTuple):
     """One array of a dictionary observation.
 
     Attributes:
-        widths: That it may have.
-        columns: How many of them are read, from the first on.
+        widths: Widths that the array may have.
+        columns: How many of its first columns are read.
     """
 
     widths: tuple[int, ...]
@@ -75,18 +75,18 @@ class Body:
     """A robot.
 
     Attributes:
-        observations: O names with units; empty where nobody named them.
+        observations: O names with units; empty if unnamed.
         actions: A names.
-        layouts: Width of a recorded row -> where the simulator's state stands in it; key 0 for any other width.
-        parts: The arrays of a dictionary observation, in order; empty where the observation is one array.
+        layouts: Width of a recorded row -> where the simulator's state is in it; key 0 for any other width.
+        parts: The arrays of a dictionary observation, in order; empty if the observation is one array.
         moves: What counts as its movement: "course", its speed along x and its height; "plane", its first two
             observations; "joints", the columns `moving`; or everything it observes.
         moving: First column and the one after the last for "joints".
-        heading: Column of its quaternion (w first) where it turns about a vertical axis; None where it does not.
+        heading: Column of its quaternion (w first) if it turns about a vertical axis; None if it does not.
         rest: Observations that are not 0 when it stands still, by column.
-        falls: Whether an episode ends when it falls, and its rewards tell one version of the environment from another.
-        walks_on: Whether D4RL's recordings run on through terminals, which were computed afterwards.
-        heights: Range of the median of the first observation, for robots of the same widths as another's.
+        falls: Whether an episode ends when it falls, and its rewards distinguish versions of the environment.
+        walks_on: Whether D4RL's recordings continue through terminals, which were computed afterwards.
+        heights: Range of the median of the first observation, to distinguish robots of the same widths.
         d4rl: Folder on D4RL's server and the version that its files' names end in.
     """
 
@@ -105,7 +105,7 @@ class Body:
 
 
 def body_of(task: Task) -> Body:
-    """The robot of a task; one without names where `BODIES` has no such row."""
+    """Return the robot of a task; one without names if `BODIES` has no such row."""
     return BODIES.get(body_name(task), _UNKNOWN)
 
 
@@ -129,25 +129,26 @@ def action_names(task: Task) -> tuple[str, ...]:
 
 
 def has_state(task: Task) -> bool:
-    """Whether the simulator's state can be told from an observation."""
+    """Whether the simulator's state can be read from an observation."""
     return bool(body_of(task).layouts)
 
 
 def state_layout(task: Task, width: int) -> StateLayout:
-    """Where the simulator's state stands in a recorded row.
+    """Return where the simulator's state is in a recorded row.
 
     Args:
         task: Any task.
-        width: Numbers of the row; tells the kitchen's two layouts apart.
+        width: Width of the row, which distinguishes the kitchen's two layouts.
 
     Raises:
-        UserError: Nobody has said where it stands.
+        UserError: The robot has no layout.
     """
     layouts = body_of(task).layouts
     if not layouts:
         raise UserError(
             f"task '{task.name}': nothing says which observations are the simulator's positions and velocities, so no "
-            "recorded state can be simulated; add a row for its robot to dds_lightning/tasks/bodies.py"
+            "recorded state can be simulated; give `positions` and `velocities` in its task file, or a row of "
+            "dds_lightning/tasks/bodies.py"
         )
     return layouts.get(width, layouts[0])
 

@@ -1,4 +1,4 @@
-"""From the environments as they are to those of our tasks: flat observations, one start, one goal."""
+"""Wrappers that turn an environment into that of a task: flat observations, one start, one goal."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def make_task_env(task: Task, render_mode: str | None = None) -> gym.Env[Flat, F
 
 @contextlib.contextmanager
 def open_env(task: Task) -> Iterator[gym.Env[Flat, Flat]]:
-    """A task's environment after a reset, closed in the end."""
+    """Yield a task's environment after a reset; it is closed at the end."""
     env = make_task_env(task)
     try:
         env.reset(seed=0)
@@ -46,7 +46,7 @@ def open_env(task: Task) -> Iterator[gym.Env[Flat, Flat]]:
 
 
 class TaskEnv(gym.Wrapper[Flat, Flat, Any, Any]):
-    """An environment whose observations are flat already, and which tells `success` itself or has none."""
+    """An environment whose observations are already flat, and which reports `success` itself or not at all."""
 
     def __init__(self, env: gym.Env[Any, Any], task: Task) -> None:
         """Wrap `env`, which must come from `build_env`."""
@@ -60,13 +60,13 @@ class TaskEnv(gym.Wrapper[Flat, Flat, Any, Any]):
         return self._outside(observation, info)
 
     def step(self, action: Flat) -> tuple[Flat, float, bool, bool, dict[str, Any]]:
-        """One step of the environment."""
+        """Take one step in the environment."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         flat, info = self._outside(observation, info)
         return flat, float(reward), bool(terminated), bool(truncated), info
 
     def _outside(self, observation: Any, info: dict[str, Any]) -> tuple[Flat, dict[str, Any]]:
-        """What the agent sees, and what the caller is told."""
+        """Return the observation for the agent and the `info` for the caller."""
         info["success"] = bool(info.get("success", False))
         return np.asarray(self.flatten(observation), dtype=np.float32), info
 
@@ -97,7 +97,7 @@ class MazeEnv(TaskEnv):
         return super()._outside(observation, info)
 
     def flatten(self, observation: Any) -> Any:
-        """The parts that the robot's row names: an ant's own observation lacks its position."""
+        """The parts that the robot's row names: the ant's observation lacks its position."""
         parts = body_of(self.task).parts.items()
         return np.concatenate([observation[name][: part.columns] for name, part in parts])
 

@@ -18,11 +18,11 @@ PAPERS_DATA = (
     "measured with D4RL's data in D4RL's physics: a score from other data or in another physics cannot be compared"
 )
 _PHYSICS = {
-    ("halfcheetah", "v4"): "the nearest heir of Gym's v2 class, in which D4RL recorded",
+    ("halfcheetah", "v4"): "the closest successor of Gym's v2 class, in which D4RL recorded",
     ("halfcheetah", "v5"): "the same physics and rewards as v4",
-    ("hopper", "v4"): "the nearest heir of Gym's v2 class, in which D4RL recorded",
+    ("hopper", "v4"): "the closest successor of Gym's v2 class, in which D4RL recorded",
     ("hopper", "v5"): "as v4, but the step that falls does not earn the reward of 1 for being upright",
-    ("walker2d", "v4"): "the nearest heir of Gym's v2 class, in which D4RL recorded; right foot's friction 0.9",
+    ("walker2d", "v4"): "the closest successor of Gym's v2 class, in which D4RL recorded; right foot's friction 0.9",
     ("walker2d", "v5"): "as v4, but the right foot's friction is 1.9 as the left one's, and the step that falls does "
     "not earn the reward of 1 for being upright",
     ("antmaze", "d4rl"): "torque of +-30 N m; starts with noise on every coordinate; every episode "
@@ -30,7 +30,7 @@ _PHYSICS = {
     ("antmaze", "robotics"): "gymnasium-robotics': torque of +-150 N m; starts at rest; the goal stands "
     "still; (0, 0) in the maze's middle, y up the map",
 }
-"""(First word of the name, physics) -> how it differs from its sisters, beside the numbers of the row."""
+"""(First part of the name, physics) -> how it differs from the other physics, apart from the numbers in the row."""
 
 _NUMBERS = {
     "env_id": "environment",
@@ -39,13 +39,13 @@ _NUMBERS = {
     "goal_radius": "goal radius",
     "goal_noise": "goal noise",
 }
-"""What a variant may change -> what it is called here."""
+"""Attributes that a variant may change -> their names in the output."""
 
 
 def task_facts(task: Task) -> dict[str, Any]:
-    """Every fact of a row of the table, in the words of `dds tasks`; what does not apply is None or empty.
+    """Return every fact about a task, by the names that `dds tasks` uses; what does not apply is None or empty.
 
-    Lengths are in metres, cells are (row, column), `data` holds what to type after `--data`.
+    Lengths are in metres, cells are (row, column), `data` holds the arguments for `--data`.
     """
     return {
         "task": task.name,
@@ -84,7 +84,7 @@ def task_facts(task: Task) -> dict[str, Any]:
 
 
 def task_lines(task: Task) -> list[tuple[str, str]]:
-    """The same facts for people: (what, words) line by line."""
+    """Return the same facts for people, as (name, text) line by line."""
     return [
         ("environment", task.env_id + (f", physics {task.physics}" if task.physics else "")),
         ("observation", f"{task.observation_dim} numbers: {task.observation_layout}"),
@@ -104,13 +104,13 @@ def task_lines(task: Task) -> list[tuple[str, str]]:
         ("evaluation", f"{task.evaluation_episodes} episodes"),
         *_data_lines(task),
         ("recorded in", " or ".join(recorded_in(task))),
-        *((name, _words(task, found)) for name, found in _variants(task).items()),
+        *((name, _variant_text(task, found)) for name, found in _variants(task).items()),
         ("paper", "no score" if task.paper_score is None else f"{task.paper_score:g} (table 1), {PAPERS_DATA}"),
     ]
 
 
 def draw_maze(task: Task) -> list[str]:
-    """The maze in letters, two a cell: ## wall, S start, G goal; rows as in the map."""
+    """Draw the maze with two characters per cell: ## wall, S start, G goal; rows as in the map."""
     letters = {"1": "##", "0": "  "}
     rows = [[letters[value] for value in row] for row in task.maze_map or ()]
     for letter, cell in (("S ", task.start_cell), ("G ", task.goal_cell)):
@@ -120,21 +120,21 @@ def draw_maze(task: Task) -> list[str]:
 
 
 def data_specs(task: Task) -> dict[str, str]:
-    """Source -> what to type after `--data` for the task's data set of that source.
+    """Map each source to the `--data` argument of the task's data set there.
 
     `dds data collect` puts local ones into the folder data; D4RL's files answer to the task's name.
     """
-    words = {"local": "data/{}", "d4rl": task.base_name, "minari": "{}"}
-    return {source: f"{source}:{words[source].format(name)}" for source, name in task.data_ids.items()}
+    places = {"local": "data/{}", "d4rl": task.base_name, "minari": "{}"}
+    return {source: f"{source}:{places[source].format(name)}" for source, name in task.data_ids.items()}
 
 
 def recorded_in(task: Task) -> tuple[str, ...]:
-    """The environments whose recordings fit the task."""
+    """Return the environments whose recordings fit the task."""
     return tuple(dict.fromkeys((task.env_id, *task.data_env_ids)))
 
 
 def reward_formula(task: Task) -> str:
-    """The reward that is learnt from, for example `0.1 * (r - 1)`; `REWARDS` says what r is."""
+    """Return the learner's reward as a formula, for example `0.1 * (r - 1)`; `REWARDS` says what r is."""
     sign = "-" if task.reward_shift < 0 else "+"
     shifted = f"(r {sign} {abs(task.reward_shift):g})" if task.reward_shift else "r"
     return shifted if task.reward_scale == 1 else f"{task.reward_scale:g} * {shifted}"
@@ -177,22 +177,22 @@ def _place(task: Task, cell: Cell | None) -> dict[str, Any] | None:
 
 
 def _variants(task: Task) -> dict[str, dict[str, Any]]:
-    """The same body in its other physics: name to type -> what is different there, as numbers and in words."""
+    """Return the task's variants: name -> what is different there, as numbers and as text."""
     base = get_task(task.base_name)
     found = {}
     for physics in task.variants:
         other = base if physics == base.physics else get_task(f"{task.base_name}@{physics}")
         numbers = {
-            words: getattr(other, name)
-            for name, words in _NUMBERS.items()
+            label: getattr(other, name)
+            for name, label in _NUMBERS.items()
             if len({getattr(get_task(f"{task.base_name}@{one}"), name) for one in task.variants}) > 1
         }
-        words = _PHYSICS.get((task.base_name.partition("-")[0], physics), "")
-        found[other.name] = {"physics": physics, **numbers, "words": words}
+        text = _PHYSICS.get((task.base_name.partition("-")[0], physics), "")
+        found[other.name] = {"physics": physics, **numbers, "words": text}
     return found
 
 
-def _words(task: Task, found: dict[str, Any]) -> str:
+def _variant_text(task: Task, found: dict[str, Any]) -> str:
     numbers = ", ".join(
         f"{name} {value}" for name, value in found.items() if name not in ("physics", "origin", "words")
     )

@@ -1,4 +1,4 @@
-"""Tasks of one's own: a YAML file, or a `Task` in a Python module, wherever the name of a task is taken.
+"""Custom tasks: a YAML file, or a `Task` in a Python module, accepted wherever a task's name is.
 
 ```yaml
 env_id: Reacher-v5            # any environment that Gymnasium knows, or "package:Name-v0" to import it first
@@ -7,7 +7,7 @@ score_min: -43                # the return that scores 0, for example of random 
 score_max: -4                 # the return that scores 100, for example of an expert
 ```
 
-Whatever else a `Task` has may be given; widths and the box of actions are read from the environment where they are not.
+Other attributes of a `Task` are optional; if not given, widths and action bounds are read from the environment.
 `positions` and `velocities` say which observations are the simulator's qpos and qvel, which `dds data check --replay`
 needs.
 """
@@ -39,16 +39,16 @@ GIVEN = (
 )
 """Attributes of a `Task` that a file may give."""
 STATE = ("positions", "velocities", "hidden")
-"""Where the simulator's state stands in an observation."""
+"""Fields that say where the simulator's state is in an observation."""
 NEEDED = ("env_id", "max_episode_steps", "score_min", "score_max")
 FAMILY = "default"
-"""Preset of tasks that name none."""
+"""Preset of tasks that do not name one."""
 _KINDS: dict[str, tuple[str, type | tuple[type, ...]]] = {
-    "str": ("a text", str),
+    "str": ("a string", str),
     "int": ("a whole number", int),
     "float": ("a number", (int, float)),
     "bool": ("true or false", bool),
-    "Mapping[str, Any]": ("names with values", dict),
+    "Mapping[str, Any]": ("a mapping of names to values", dict),
 }
 
 
@@ -61,11 +61,11 @@ def load_task(address: str) -> Task:
     """Read a task from a YAML file or from a Python module.
 
     Args:
-        address: Path that ends in `.yaml`, or `package.module:NAME` of a `Task`. A module is code, and it is run.
+        address: Path that ends in `.yaml`, or `package.module:NAME` of a `Task`; the module is imported, which executes
+            its code.
 
     Raises:
-        UserError: It cannot be read, or is not a task; the message names the field, what was found and what was
-            expected.
+        UserError: It cannot be read or is not a task; the message names the field, its value and what was expected.
     """
     if not address.endswith((".yaml", ".yml")):
         return _from_module(address)
@@ -84,7 +84,7 @@ def load_task(address: str) -> Task:
 
 
 def definition(task: Task) -> dict[str, Any]:
-    """A task of one's own as plain values, from which `build_task` makes it again."""
+    """Return a custom task as plain values, from which `build_task` restores it."""
     values: dict[str, Any] = {name: getattr(task, name) for name in GIVEN}
     values["env_options"] = dict(values["env_options"])
     if task.body == task.name and has_state(task):
@@ -94,13 +94,13 @@ def definition(task: Task) -> dict[str, Any]:
 
 
 def build_task(given: Mapping[str, Any], where: str, trusted: bool = True) -> Task:
-    """Make a task from the values of a file or of a `definition`.
+    """Build a task from the values of a file or of a `definition`.
 
     Args:
         given: Names to values; see `GIVEN` and `STATE`.
         where: The file, for messages.
-        trusted: Whether `env_id` may name a module to import, and `env_options` files; not for what came with an
-            agent. The environment then is not built before it is played.
+        trusted: Whether `env_id` may name a module to import, and `env_options` files; False for definitions that
+            come with an agent. In that case the environment is not built before it is played.
 
     Raises:
         UserError: See `load_task`.
@@ -115,10 +115,10 @@ def build_task(given: Mapping[str, Any], where: str, trusted: bool = True) -> Ta
     types = {field.name: str(field.type) for field in fields(Task)}
     values: dict[str, Any] = {}
     for name in (name for name in GIVEN if given.get(name) is not None):
-        words, kind = _KINDS[types[name]]
+        description, kind = _KINDS[types[name]]
         value: Any = given[name]
         if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-            raise UserError(f"task: {where} sets {name} to {value!r}, expected {words}")
+            raise UserError(f"task: {where} sets {name} to {value!r}, expected {description}")
         values[name] = float(str(value)) if types[name] == "float" else value
     _check(values, where, trusted)
     asked = {} if not trusted and "observation_dim" in values else _read_environment(values, where)
@@ -153,7 +153,7 @@ def _check(values: Mapping[str, Any], where: str, trusted: bool) -> None:
 
 
 def _read_environment(values: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Widths, the box of actions and the length of a step, by asking the environment.
+    """Read widths, action bounds and the length of a step from the environment.
 
     Raises:
         UserError: Gymnasium does not know it, or its spaces are not flat.
@@ -193,7 +193,7 @@ def _read_environment(values: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def _body(task: Task, layout: Mapping[str, Any], where: str) -> Body:
-    """A robot whose observations hold the simulator's state where the file says."""
+    """Return a robot whose observations hold the simulator's state in the columns that the file gives."""
     for name in STATE[:2]:
         columns = layout.get(name)
         if not isinstance(columns, list) or not all(type(c) is int and 0 <= c < task.observation_dim for c in columns):
@@ -201,7 +201,7 @@ def _body(task: Task, layout: Mapping[str, Any], where: str) -> Body:
             raise UserError(f"task: {where} sets {name} to {columns!r}, expected {expected}")
     hidden = layout.get("hidden", 0)
     if type(hidden) is not int or hidden < 0:
-        raise UserError(f"task: {where} sets hidden to {hidden!r}, expected a number of positions that are left out")
+        raise UserError(f"task: {where} sets hidden to {hidden!r}, expected the number of positions left out")
     names = tuple(f"observation {j}" for j in range(task.observation_dim))
     positions, velocities = tuple(layout["positions"]), tuple(layout["velocities"])
     return Body(layouts={0: StateLayout(names, positions, velocities, len(velocities), hidden)})

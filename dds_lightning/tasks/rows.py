@@ -14,7 +14,7 @@ _KINDS = ("", "_Diverse_G", "_Diverse_GR")
 
 
 def _with_variants(task: Task, **others: Mapping[str, Any]) -> Task:
-    """Give a row its variants: physics -> the attributes that differ from the row's."""
+    """Add variants to a row: physics -> the attributes that differ from the row's."""
     differ = dict.fromkeys(name for changes in others.values() for name in changes)
     own = {name: getattr(task, name) for name in differ}
     return replace(task, variants={task.physics: own, **{name: {**own, **changes} for name, changes in others.items()}})
@@ -24,10 +24,10 @@ def _with_variants(task: Task, **others: Mapping[str, Any]) -> Task:
 
 
 def _locomotion() -> tuple[Task, ...]:
-    """Three bodies, three data qualities. D4RL recorded in Gym's v2 classes, whose nearest heir is v4.
+    """Three bodies, three data qualities. D4RL recorded in Gym's v2 classes, whose closest successor is v4.
 
-    Rewards are learnt at a scale at which ten steps of an expert are worth about 3: at their own scale the
-    critic's targets run into the hundreds and the advantage weights are clipped throughout.
+    Rewards are scaled so that ten steps of an expert are worth about 3: unscaled, the critic's targets run into the
+    hundreds and the advantage weights are clipped throughout.
     """
     bodies = (
         ("halfcheetah", "HalfCheetah", 17, 6, 0.05, -280.178953, 12135.0, (42.5, 41.6, 94.2)),
@@ -79,7 +79,7 @@ def _antmaze(size: str, *, file: str, goals: tuple[Cell, ...], scores: Any) -> t
 
     Args:
         size: "umaze", "medium" or "large".
-        file: The part of D4RL's file names that tells the maze.
+        file: The part of D4RL's file names that identifies the maze.
         goals: Cells among which D4RL's generation maps draw goals.
         scores: Recipe -> the paper's score.
 

@@ -1,4 +1,4 @@
-"""What a task is: one environment, one start and one goal, and how its scores and rewards are read."""
+"""The definition of a task: one environment, one start and one goal, and how its scores and rewards are computed."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ Cell = tuple[int, int]
 class Task:
     """One row of the task table.
 
-    A body may be simulated in more than one way: D4RL's AntMaze files were recorded with other torques and
-    another time step than gymnasium-robotics has. Such a row has `variants`: `NAME` is the physics that the
-    published scores belong to, `NAME@VARIANT` another one. A variant is a task like any other; it never
-    changes the widths of observations and actions.
+    A body may be simulated in more than one way: D4RL's AntMaze files were recorded with different torques and a
+    different time step from gymnasium-robotics. Such a row has `variants`: `NAME` is the physics that the published
+    scores belong to, `NAME@VARIANT` another one. A variant is a task like any other; it never changes the widths of
+    observations and actions.
 
     Attributes:
         name: What a user types, for example `pointmaze-large-diverse` or `hopper-medium@v5`.
@@ -30,19 +30,19 @@ class Task:
         env_id: Gymnasium's name of the environment.
         observation_dim: O, the width of the flat observation. In mazes it never holds the goal: one task has
             one goal.
-        observation_layout: Which numbers stand where in an observation, in words.
+        observation_layout: Description of the numbers in an observation, in order.
         action_dim: A.
         action_low: Lower bound of every action entry.
         action_high: Upper bound of every action entry.
         max_episode_steps: Steps after which an evaluation episode is truncated.
-        step_seconds: Simulated seconds a step.
-        env_options: More arguments of the environment's constructor.
-        adapter: How the environment's observations become flat ones: "flat" takes them as they are, "maze"
-            and "kitchen" read gymnasium-robotics' dictionaries.
-        physics: Name of this variant; "" where there is only one.
-        variants: Name of a physics -> its values of the attributes in which the physics differ; this row's own
-            `physics` is among them.
-        maze_map: Rows of the maze, "1" wall and "0" free; None where there is no maze.
+        step_seconds: Simulated seconds per step.
+        env_options: Further arguments to the environment's constructor.
+        adapter: How the environment's observations are flattened: "flat" takes them as they are, "maze" and
+            "kitchen" read gymnasium-robotics' dictionaries.
+        physics: Name of this variant; "" if there is only one.
+        variants: Name of a physics -> its values of the attributes in which the physics differ, including this
+            row's `physics`.
+        maze_map: Rows of the maze, "1" wall and "0" free; None if there is no maze.
         cell_size: Side of a cell in metres.
         origin: Where (0, 0) lies: in the maze's "centre" with y up (gymnasium-robotics), or in the middle of
             the "start" cell with y growing down the map (D4RL).
@@ -51,24 +51,22 @@ class Task:
         goal_radius: Distance to the goal in metres that counts as success.
         goal_noise: Mean distance in metres, on both axes, of evaluation goals from the goal cell's centre.
             D4RL's AntMaze draws each episode's goal from a one-sided range; elsewhere this is 0.
-        subtasks: In the kitchen, what has to be done.
+        subtasks: The subtasks of the kitchen, in the order of the published task.
         measures_success: Whether an episode can succeed; a runner only scores.
-        data_reward: What the learner's rewards are made from: "environment", as recorded; "goal", 1 where the
-            step reaches the task's goal; "arrival", the same where the recording says so, because its goal is one
-            of many; "subtasks", the number of subtasks that are done in the state
-            reached, at every step.
+        data_reward: Source of the learner's rewards: "environment", as recorded; "goal", 1 if the step reaches the
+            task's goal; "arrival", the same as judged by the recording, whose goal is one of many; "subtasks", the
+            number of subtasks that are done in the state reached, at every step.
         reward_scale: The learner's reward is `reward_scale * (reward + reward_shift)`; scores never use it.
         reward_shift: See `reward_scale`.
-        score_min: Return of the environment's own rewards that scores 0.
+        score_min: Return, in the environment's rewards, that scores 0.
         score_max: Return that scores 100.
         evaluation_episodes: Episodes behind a published score.
         data_ids: Source -> name of the data set in that source.
-        data_env_ids: Environments whose recordings fit this task (same body, same walls); `env_id` always
-            does.
+        data_env_ids: Further environments whose recordings fit this task (same body, same walls).
         data_start_cells: Cells where collected episodes start; None means every free cell.
         data_goal_cells: Cells that collected episodes head for; None means every free cell.
         paper_score: Normalised score that the paper reports in its table 1, if it does.
-        body: Name of the robot in `tasks.bodies`; "" takes the first word of the task's name.
+        body: Name of the robot in `tasks.bodies`; "" takes the first part of the task's name.
     """
 
     name: str
@@ -113,7 +111,7 @@ class Task:
         """The same task in another physics, named `NAME@PHYSICS`.
 
         Raises:
-            UserError: When this task has no such physics.
+            UserError: This task has no such physics.
         """
         if physics not in self.variants:
             known = ", ".join(f"{self.base_name}@{name}" for name in self.variants) or "no variants"
@@ -132,7 +130,7 @@ class Task:
         return "@" in self.name
 
     def accepts(self, env_id: str) -> bool:
-        """Whether recordings of an environment fit this task as it is."""
+        """Whether recordings from an environment fit this task without changes."""
         return env_id == self.env_id or env_id in self.data_env_ids
 
     # ------------------------------------------------------------------ geometry
@@ -164,7 +162,7 @@ class Task:
             xy: (..., 2) x and y in metres.
 
         Returns:
-            (..., 2) row and column; outside the maze the numbers run on past its edges.
+            (..., 2) row and column; outside the maze the numbering continues.
         """
         row0, column0, down = self._frame()
         xy = np.asarray(xy, dtype=np.float64)
@@ -194,7 +192,7 @@ class Task:
 
     def _maze(self) -> tuple[str, ...]:
         if self.maze_map is None:
-            raise UserError(f"task '{self.name}' has no maze: cells mean nothing there")
+            raise UserError(f"task '{self.name}' has no maze: cells are undefined there")
         return self.maze_map
 
     # ------------------------------------------------------------------ scores
@@ -203,7 +201,7 @@ class Task:
         """D4RL's normalised score, 0 to 100: `100 * (return - score_min) / (score_max - score_min)`.
 
         Args:
-            returns: Sums of the environment's own rewards.
+            returns: Sums of the environment's rewards.
         """
         returns = np.asarray(returns, dtype=np.float64)
         return 100.0 * (returns - self.score_min) / (self.score_max - self.score_min)
@@ -213,10 +211,9 @@ class Task:
     def make_env(self, render_mode: str | None = None) -> gym.Env[NDArray[np.float32], NDArray[np.float32]]:
         """The evaluation environment: flat float32 observations, this task's start and goal at every reset.
 
-        In mazes the body starts in `start_cell` with the environment's own noise, and reaching the goal ends
-        the episode. The goal is exactly the centre of `goal_cell`, except where `goal_noise` says that it
-        moves. `info` holds `success` (bool) after every reset and step, in mazes `position` (2,), in the
-        kitchen `subtasks_done` (int).
+        In mazes the body starts in `start_cell` with the environment's noise, and reaching the goal ends the
+        episode. The goal is exactly the centre of `goal_cell` unless the task has `goal_noise`. `info` holds `success`
+        (bool) after every reset and step, in mazes `position` (2,), in the kitchen `subtasks_done` (int).
 
         Args:
             render_mode: Gymnasium's render mode, for example "rgb_array".

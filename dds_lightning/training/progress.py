@@ -16,13 +16,13 @@ from dds_lightning.saving.run_directory import duration
 class StepProgress(ProgressBar):
     """Count optimiser steps towards `max_steps`, across epochs.
 
-    Lightning's own bars count batches of an epoch, which means nothing where an epoch is as long as the data and a
-    training as long as its steps. On a terminal the line is redrawn a few times a second; in a log file a line is
-    written every minute. Metrics are read only then, so that a step never waits for the device.
+    Lightning's bars count the batches of an epoch, but here a training is measured in optimiser steps. On a terminal
+    the line is redrawn a few times a second; in a log file a line is written every minute. Metrics are read only
+    then, so that a step never waits for the device.
 
     Args:
-        metrics: names to show, the first of them that were logged; without their `train/`.
-        log_every_n_seconds: seconds between two lines where standard error is no terminal.
+        metrics: Names of the metrics to show, if they were logged; a leading `train/` is dropped.
+        log_every_n_seconds: Seconds between two lines where standard error is not a terminal.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class StepProgress(ProgressBar):
         self._enabled = True
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Begin to count."""
+        """Start counting."""
         self._started, self._first_step = time.monotonic(), trainer.global_step
         self._next = self._started + (0 if self._terminal else self.log_every_n_seconds)
         if self._enabled and self._terminal and trainer.is_global_zero:
@@ -80,11 +80,11 @@ class StepProgress(ProgressBar):
         return "  ".join(f"{name.removeprefix('train/')} {float(value):.4g}" for name, value in shown)
 
     def teardown(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
-        """Take the line away."""
+        """Remove the line."""
         self._close()
 
     def on_exception(self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException) -> None:
-        """Take the line away before the message appears."""
+        """Remove the line before the message appears."""
         self._close()
 
     def _close(self) -> None:

@@ -77,7 +77,7 @@ def test_a_run_with_skills_alone_knows_its_data_and_compares_with_others(dds, pl
     (run / "skill" / "stage.json").write_text(json.dumps({"state": "started"}))
     status, _, err = dds("atlas", run)
     assert status == 2
-    assert "has not learnt its skills yet" in err
+    assert "whose skills are not trained yet" in err
 
 
 def refused(answer, *parts):

@@ -188,7 +188,7 @@ def test_options_pin_the_goal_the_cell_and_the_pose(env: Any) -> None:
     [
         ({"goal_cell": (1, 1)}, "no option 'goal_cell'"),
         ({"reset_cell": (0, 0)}, r"reset_cell is \(0, 0\), a wall"),
-        ({"reset_cell": (1, 99)}, r"outside of the maze"),
+        ({"reset_cell": (1, 99)}, r"outside the maze"),
     ],
 )
 def test_wrong_options_are_refused_in_a_sentence(env: Any, options: dict[str, Any], message: str) -> None:

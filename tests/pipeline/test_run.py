@@ -22,7 +22,7 @@ from dds_lightning.errors import UserError
 from dds_lightning.pipeline.settings import RunSettings, Trainings
 from dds_lightning.pipeline.steps import STEPS
 from dds_lightning.study import report
-from dds_lightning.study.contestants import final_table, way_name
+from dds_lightning.study.contestants import final_contestants, way_name
 from dds_lightning.tasks import get_task
 
 TASK = "pointmaze-umaze-diverse"
@@ -323,7 +323,7 @@ def test_a_run_publishes_the_chosen_way_and_shows_it_first():
         def variant(self, *args, **settings):
             return (args, settings)
 
-    names = [c.name for c in final_table(Agent(), get_task(TASK), 5, 2)]
+    names = [c.name for c in final_contestants(Agent(), get_task(TASK), 5, 2)]
     assert names[0] == "AWR policy, greedy"
     assert len(names) == len(set(names)) == 6
 

@@ -47,9 +47,9 @@ def test_the_card_names_task_score_seed_data_settings_and_command():
         "`dds run pointmaze-large-diverse --seed=3`",
         "| random skills | 2 | 0.0 |",
         "a skill every 10 steps",
-        "(the skills can be used again). The\ndata come from this project's controllers: scores are not comparable",
+        "The data come from this project's controllers: scores are not comparable",
     ):
-        assert part in text
+        assert part in text or part in " ".join(text.split())
     assert max(map(len, text.splitlines())) < 200
 
 
@@ -61,7 +61,7 @@ def test_the_card_names_task_score_seed_data_settings_and_command():
             "hopper-medium@v5",
             "minari:mujoco/hopper/medium-v0",
             "one body",
-            "given by whoever trained it (minari:mujoco",
+            "provided by the user who trained it (minari:mujoco",
         ),
         ("kitchen-partial", "d4rl:kitchen.hdf5", "4 subtasks (microwave, kettle, light switch, slide cabinet)", "D4RL"),
         ("antmaze-medium-play", "d4rl:ant.hdf5", "one maze, one start and one goal", "d4rl:ant.hdf5"),

@@ -19,7 +19,7 @@ from dds_lightning.rollout.result import RolloutPath, RolloutResult
 from dds_lightning.skill import SkillModule
 from dds_lightning.study import findings
 from dds_lightning.study import report as report_module
-from dds_lightning.study.report import report, told, write_report
+from dds_lightning.study.report import report, summary_lines, write_report
 from dds_lightning.study.skill_replays import junctions, replay_skills
 from dds_lightning.tasks import get_task
 
@@ -170,9 +170,9 @@ def test_facts_are_plain_json_and_say_where_the_main_contestant_failed(made):
 
 def test_facts_read_back_from_a_marker_are_told_alike(made):
     facts = {name: made[name] for name in ("task", "main", "protocol", "table", "failures")}
-    assert len(told(json.loads(json.dumps(facts)))) == 3
+    assert len(summary_lines(json.loads(json.dumps(facts)))) == 3
     del facts["protocol"]  # a run of an older version
-    assert told(facts)[0] == TASK.name
+    assert summary_lines(facts)[0] == TASK.name
 
 
 def test_what_a_killed_launch_logged_too_much_is_left_out(run, tmp_path):

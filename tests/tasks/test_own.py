@@ -88,7 +88,7 @@ def test_files_that_are_none_are_refused(tmp_path):
 
 
 def test_a_name_of_the_table_is_not_taken(tmp_path):
-    with pytest.raises(UserError, match="name is hopper-medium, which the table has already"):
+    with pytest.raises(UserError, match="name is hopper-medium, which is already in the table"):
         get_task(file(tmp_path / "hopper-medium.yaml"))
 
 

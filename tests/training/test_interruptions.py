@@ -59,7 +59,7 @@ def test_a_training_saves_and_names_the_command_that_goes_on(capsys, monkeypatch
     with monkeypatch.context() as patch:
         interrupt(patch, SkillModule if stage == "skill" else PolicyModule, "training_step", signum, 3)
         err = stopped(capsys, words, signum)
-    assert "the state is in out/last.ckpt, and this goes on from it:" in err
+    assert "the state is in out/last.ckpt, and this command continues from it:" in err
     assert torch.load("out/last.ckpt", weights_only=True)["global_step"] == 3
     again = resuming_words(err)
     assert again == [*map(str, words), "--ckpt_path", "out/last.ckpt"]
@@ -91,7 +91,7 @@ def test_relabelling_goes_on_where_it_stopped(capsys, monkeypatch, data, skill, 
     assert batches > 3
     calls = interrupt(monkeypatch, SkillModule, "encode", signum, 3)
     err = stopped(capsys, [*words, "stopped.safetensors"], signum)
-    assert "the same command goes on where it stopped" in err
+    assert "the same command continues where it stopped" in err
     assert not Path("stopped.safetensors").exists()
     assert call(*resuming_words(err)) == 0
     assert len(calls) == batches + 1  # the third batch began twice, the first two did not
@@ -120,7 +120,7 @@ def test_collecting_goes_on_where_it_stopped(capsys, monkeypatch, data, signum):
     calls = interrupt(monkeypatch, pointmaze._Recorder, "__call__", signum, 6)
     words = ["data", "collect", TASK, "--steps", "4000", "--workers", "1", "--out", "data"]
     err = stopped(capsys, words, signum)
-    assert "the same command goes on where it stopped" in err
+    assert "the same command continues where it stopped" in err
     assert resuming_words(err) == words
     assert call(*words) == 0
     assert len(calls) == 8 + 2  # of eight episodes the first four were kept, the fifth and half of the sixth not
@@ -131,7 +131,7 @@ def test_a_run_goes_on_where_it_stopped(capsys, monkeypatch, signum):
     words = ["run", TASK, "--out", "run", "--data_steps=2000", "--workers=1", "--until=data", "--fresh"]
     calls = interrupt(monkeypatch, pointmaze._Recorder, "__call__", signum, 2)
     err = stopped(capsys, words, signum)
-    assert "the same command goes on where it stopped" in err
+    assert "the same command continues where it stopped" in err
     assert resuming_words(err) == words[:-1]  # --fresh would begin anew
     assert call(*resuming_words(err)) == 0
     assert len(calls) == 4 + 2

@@ -19,7 +19,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from datamodules.trajectories import Trajectories
-from dds_lightning.interpret.atlas.pictures import Picture, Studio, Tell
+from dds_lightning.interpret.atlas.pictures import Announce, AtlasPictures, Picture
 from dds_lightning.interpret.draw import charts
 from dds_lightning.interpret.measure import statistics
 from dds_lightning.interpret.measure.comparison import compare_recovery
@@ -35,32 +35,32 @@ if TYPE_CHECKING:
     from dds_lightning.skill import SkillModule
 
 STATES, STARTS = 32, 8
-"""States from which codes are recovered, and among which the start of a body's pictures is chosen."""
+"""Number of states from which codes are recovered, and of those among which a body's starting state is chosen."""
 DISCRETE, CONTINUOUS = "discrete skills", "continuous skills, clustered"
-"""What models that are compared are called, by kind."""
+"""Names of the models in a comparison, by kind."""
 RARE = 0.1
-"""A code is in use when it holds this share of 1 / K of the data."""
+"""A code is in use if its share of the data is at least this fraction of 1 / K."""
 
 
 @dataclass(frozen=True, eq=False)
 class Atlas:
-    """What is known of a checkpoint's skills.
+    """Everything known about a checkpoint's skills.
 
     Attributes:
-        task: where they were replayed.
+        task: The task in which they were replayed.
         horizon: H.
-        table: a row a code: `statistics.skill_table` with `spread` and `apart` (`decoder_diversity`), `nearest` and
-            `near` (code and its distance in the codebook), `again` and `recovered` (shares of the round trip's and of
-            the recovery's replays; NaN for codes out of use), and, where they played alone, `alone` (per cent that
+        table: One row per code: `statistics.skill_table` with `spread` and `apart` (`decoder_diversity`), `nearest` and
+            `near` (code and its distance in the codebook), `again` and `recovered` (shares of the round trip's and
+            of the recovery's replays; NaN for codes not in use), and, if they played alone, `alone` (per cent that
             succeed, else the normalised score) and `alone_episodes`.
-        trip: codes told from behaviour in states where the data use them.
-        recovery: the same from any state, of the codes in use.
+        trip: How well codes are recognised from behaviour in states where the data use them.
+        recovery: The same from any state, for the codes in use.
         transitions: (K, K), see `statistics.transition_matrix`.
         distances: (K, K), see `statistics.code_distances`.
-        comparison: of `recovery.compare_recovery`, if there were other models.
-        segments: number of segments of the data that were encoded.
-        pictures: of the page, by name.
-        clips: code to its clip.
+        comparison: Table from `recovery.compare_recovery`, if other models were given.
+        segments: Number of segments of the data that were encoded.
+        pictures: Pictures of the page, by name.
+        clips: The clip of each code.
     """
 
     task: Task
@@ -106,28 +106,28 @@ def make_atlas(
     states: int = STATES,
     segments: int = 20_000,
     seed: int = 0,
-    tell: Tell = lambda words: None,
+    announce: Announce = lambda message: None,
 ) -> Atlas:
     """Measure and draw everything.
 
     Args:
-        agent: the skills; its policy too, if it has one.
-        task: where they are replayed.
-        trajectories: the data of that task.
-        result: episodes of the policy and of single skills, with paths; without it they are left out.
-        main: the contestant of `result` whose episodes are shown.
-        singles: the contestant of `result` whose parts are single skills.
-        others: names and models to compare with, see `recovery.compare_recovery`.
-        states: from which every code is replayed to be recovered, and segments for each code's round trip.
-        segments: of the data that are encoded, about.
-        seed: of every draw.
-        tell: told what is being done.
+        agent: The skills; its policy too, if it has one.
+        task: The task in which they are replayed.
+        trajectories: The data of that task.
+        result: Episodes of the policy and of single skills, with paths; without it they are left out.
+        main: The contestant of `result` whose episodes are shown.
+        singles: The contestant of `result` whose parts are single skills.
+        others: Names and models to compare with, see `recovery.compare_recovery`.
+        states: Number of states from which every code is replayed, and of segments for each code's round trip.
+        segments: Approximate number of segments of the data to encode.
+        seed: Seed of all draws.
+        announce: Called with a message before each step.
 
     Raises:
-        UserError: model and data do not fit.
+        UserError: The model does not fit the data.
     """
     skill = agent.skill
-    tell("encoding the data")
+    announce("encoding the data")
     coded = statistics.code_segments(skill, trajectories, segments, seed)
     table = statistics.skill_table(task, coded, agent.policy)
     used = np.flatnonzero(coded.share >= RARE / skill.num_skills)
@@ -135,13 +135,13 @@ def make_atlas(
     table["nearest"] = statistics.nearest_codes(distances)
     table["near"] = distances[np.arange(len(distances)), table["nearest"]]
     if not has_state(task):
-        tell("playing skills at random: the data do not hold the simulator's state")
+        announce("playing skills at random: the data do not hold the simulator's state")
     stage = trajectories if has_state(task) else play_skills(task, skill, seed=seed)
     drawn = draw_states(task, stage, states, seed)
     spread = statistics.decoder_diversity(skill, drawn.observations, noise_scale=agent.noise_scale, seed=seed)
     table[["spread", "apart"]] = spread[["spread", "apart"]]
     with simulator(task) as env:
-        tell("telling codes from behaviour")
+        announce("recognising codes from behaviour")
         trip = round_trip(task, skill, stage, states, agent.noise_scale, seed, env)
         recovery, _ = code_recovery(task, skill, drawn, used, agent.noise_scale, seed, env)
         for name, codes, shares in (
@@ -151,25 +151,25 @@ def make_atlas(
             table[name] = pd.Series(shares, index=codes).reindex(table["code"]).to_numpy()
         if singles is not None and result is not None:
             table = table.join(_alone(task, result, singles), on="code")
-        studio = Studio(task, agent, env, seed, tell)
-        studio.skills(table, used, drawn.take(np.arange(min(STARTS, len(drawn)))))
+        drawings = AtlasPictures(task, agent, env, seed, announce)
+        drawings.skills(table, used, drawn.take(np.arange(min(STARTS, len(drawn)))))
         if result is not None and main is not None:
-            studio.episodes(result, main)
-        studio.values()
-    tell("drawing")
+            drawings.episodes(result, main)
+        drawings.values()
+    announce("drawing")
     transitions = statistics.transition_matrix(coded)
-    studio.diversity(table)
-    studio.matrices(trip, recovery, transitions, distances, coded)
+    drawings.diversity(table)
+    drawings.matrices(trip, recovery, transitions, distances, coded)
     comparison = None
     if others:
         rows = [(DISCRETE, skill), *others]
         comparison = compare_recovery(
-            task, stage, rows, skill.num_skills, states, seed, lambda name: tell(f"comparing: {name}")
+            task, stage, rows, skill.num_skills, states, seed, lambda name: announce(f"comparing: {name}")
         )
-        studio.keep(
+        drawings.keep(
             "comparison",
             charts.plot_comparison(comparison),
-            "A dot is a model, a bar the mean of those of one name. Continuous skills were put into "
+            "A dot is a model, a bar the mean of the models of one name. Continuous skills were grouped into "
             f"{skill.num_skills} clusters, whose centres were replayed.",
             "Bars of round trip, recovery and information of each model, with control, chance and limit marked.",
         )
@@ -183,13 +183,13 @@ def make_atlas(
         distances=distances,
         comparison=comparison,
         segments=len(coded.codes),
-        pictures=studio.pictures,
-        clips=studio.clips,
+        pictures=drawings.pictures,
+        clips=drawings.clips,
     )
 
 
 def _alone(task: Task, result: RolloutResult, singles: str) -> pd.DataFrame:
-    """How each skill does by itself, indexed by code."""
+    """Return how well each skill does by itself, indexed by code."""
     played = result.episodes[result.episodes["actor"] == singles]
     groups = played.groupby("final_code")
     goal = task.measures_success and not task.subtasks

@@ -1,4 +1,4 @@
-"""The skill atlas as one HTML file: pictures inside it, no script, nothing from a network, light and dark.
+"""The skill atlas as one HTML file with embedded pictures, without scripts or network access, in light and dark.
 
 The page itself is the template `page.html.jinja`; here are its tables of columns and sections.
 """
@@ -23,15 +23,15 @@ from dds_lightning.tasks import Task
 
 
 class Measure(NamedTuple):
-    """A number of a code as the page shows it.
+    """A number about a code, and how the page shows it.
 
     Attributes:
         name: Column of the atlas' table.
         heading: Short name.
-        unit: Unit behind the number; "" for none.
+        unit: Unit after the number; "" for none.
         form: Format of the number.
         factor: Factor that converts the column to the unit.
-        words: What the number is, in a sentence.
+        meaning: What the number is, in a sentence.
         card: Whether a skill's card shows it too; the table shows all.
     """
 
@@ -40,7 +40,7 @@ class Measure(NamedTuple):
     unit: str
     form: str = ".2f"
     factor: float = 1.0
-    words: str = ""
+    meaning: str = ""
     card: bool = True
 
 
@@ -50,37 +50,39 @@ def measures(task: Task) -> list[Measure]:
     far, fast = view.units
     goal = task.measures_success and not task.subtasks
     return [
-        Measure("share", "share of the data", "%", ".1f", 100, "Segments of the data to which the encoder gives it."),
-        Measure("chosen", "chosen", "%", ".1f", 100, "How likely the policy chooses it, over the states of the data."),
-        Measure("again", "found again", "%", ".0f", 100, "Its replays, where the data use it, that are it again."),
-        Measure("recovered", "recovered", "%", ".0f", 100, "Its replays, from any state, that are it again.", False),
-        Measure("alone", "alone", "%" if goal else "points", ".0f", 1, _alone_words(goal)),
+        Measure("share", "share of the data", "%", ".1f", 100, "Segments of the data that the encoder gives it."),
+        Measure("chosen", "chosen", "%", ".1f", 100, "Probability that the policy chooses it, over all states."),
+        Measure("again", "found again", "%", ".0f", 100, "Replays in the code's own states that get it again."),
+        Measure("recovered", "recovered", "%", ".0f", 100, "Replays from any state that get it again.", False),
+        Measure("alone", "alone", "%" if goal else "points", ".0f", 1, _alone_meaning(goal)),
         Measure("distance", "displacement", far, ".2f", 1, f"How far a segment moves {view.mover}, on average."),
         Measure("dx", "along x", "m", "+.2f", 1, "Mean displacement along x."),
         Measure("dy", "along y", "m", "+.2f", 1, "Mean displacement along y."),
         Measure("dz", "along z", "m", "+.2f", 1, "Mean displacement along z."),
-        Measure("ahead", "ahead", "m", "+.2f", 1, "Mean displacement along the way it faces when a segment begins."),
-        Measure("left", "to its left", "m", "+.2f", 1, "Mean displacement across that way."),
-        Measure("speed", "speed", fast, ".2f", 1, "Mean speed along the way."),
+        Measure("ahead", "ahead", "m", "+.2f", 1, "Mean displacement in the direction it faces at first."),
+        Measure("left", "to its left", "m", "+.2f", 1, "Mean displacement to the left of that direction."),
+        Measure("speed", "speed", fast, ".2f", 1, "Mean speed along the path."),
         Measure("turn", view.turn, "°", "+.1f", 1, f"How far {view.turns}, on average."),
-        Measure("turning", "turning", "°", ".1f", 1, "The size of it, left or right.", False),
-        Measure("reward", "reward", "", ".3g", 1, "Of a segment, not discounted, in the task's own unit."),
+        Measure("turning", "turning", "°", ".1f", 1, "Its absolute value, left or right.", False),
+        Measure("reward", "reward", "", ".3g", 1, "Reward of a segment, undiscounted, in the task's unit."),
         Measure("value", "value", "", ".3g", 1, "The critic's V where segments with this code begin."),
-        Measure("action", "size of actions", "%", ".0f", 100, "Of an entry; 100 is the edge of the box.", False),
+        Measure("action", "size of actions", "%", ".0f", 100, "Size of an entry; 100 is the edge of the box.", False),
         Measure("change", "change of actions", "%", ".0f", 100, "Between one step and the next, in half boxes.", False),
         Measure("bound", "actions at a bound", "%", ".0f", 100, "Entries at the edge of their box.", False),
-        Measure("spread", "spread over noise", "%", ".1f", 100, "Of an action in one state; the decoder's diversity."),
-        Measure("apart", "apart from others", "%", ".1f", 100, "Mean action from that of all codes.", False),
+        Measure("spread", "spread over noise", "%", ".1f", 100, "Spread of an action in one state."),
+        Measure(
+            "apart", "apart from others", "%", ".1f", 100, "Distance of its mean action from that of all codes.", False
+        ),
     ]
 
 
-def _alone_words(goal: bool) -> str:
+def _alone_meaning(goal: bool) -> str:
     what = "Episodes that reach the goal" if goal else "Normalised score"
-    return f"{what} when nothing but this skill is played."
+    return f"{what} when only this skill is played."
 
 
 class Section(NamedTuple):
-    """A section of the page; one that has none of its pictures is left out.
+    """A section of the page; it is left out if none of its pictures exist.
 
     Attributes:
         anchor: The section's id, and its name in the navigation.
@@ -95,12 +97,12 @@ class Section(NamedTuple):
 
 SECTIONS = (
     Section("replays", "What each skill does", ("strobe", "rendered", "starts_by_skill", "skills_by_start")),
-    Section("episodes", "How the policy strings them together", ("stitching", "trajectories")),
+    Section("episodes", "How the policy combines them", ("stitching", "trajectories")),
     Section("values", "What the critic believes", ("values",)),
     Section("skills", "The skills one by one"),
-    Section("recovery", "Is a skill told by what it does?", ("trip", "recovery", "effects", "comparison")),
+    Section("recovery", "Can a skill be recognised from its behaviour?", ("trip", "recovery", "effects", "comparison")),
     Section("places", "Where they are used", ("where",)),
-    Section("relations", "What lies between them", ("transitions", "distances", "diversity")),
+    Section("relations", "How they relate", ("transitions", "distances", "diversity")),
     Section("numbers", "All numbers"),
 )
 
@@ -110,8 +112,8 @@ def page(atlas: Atlas, about: Sequence[tuple[str, str]] = (), command: str = "")
 
     Args:
         atlas: What the page shows.
-        about: Facts for its head, as (name, text).
-        command: The command that makes the page again.
+        about: Facts for the page's header, as (name, text).
+        command: The command that recreates the page.
     """
     table = atlas.table.astype({"code": int, "nearest": int})
     ranked = table.sort_values("share", ascending=False, kind="stable").to_dict(orient="records")
@@ -147,13 +149,13 @@ def _number(value: Any, measure: Measure) -> str:
 
 
 def write_atlas(atlas: Atlas, path: str | Path, about: Sequence[tuple[str, str]] = (), command: str = "") -> Path:
-    """Write the page: one HTML file that needs nothing else.
+    """Write the page as one self-contained HTML file.
 
     Args:
         atlas: The result of `make_atlas`.
-        path: The file.
-        about: Facts for its head, such as the checkpoint and the data, as (name, text).
-        command: The command that makes the page again.
+        path: The file to write.
+        about: Facts for the page's header, such as the checkpoint and the data, as (name, text).
+        command: The command that recreates the page.
 
     Returns:
         The file.

@@ -1,4 +1,4 @@
-"""The pictures of a skill atlas: what each skill does, how they are strung together, where they are used."""
+"""The pictures of a skill atlas: what each skill does, how the policy combines them, where they are used."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 
 DPI = 130
 STROBES = 4
-"""Skills in a stroboscopic picture."""
+"""Number of skills in a stroboscopic picture."""
 
-Tell = Callable[[str], None]
-"""Told in words what is being done."""
+Announce = Callable[[str], None]
+"""Receives a message about what is being done."""
 
 
 @dataclass(frozen=True)
@@ -40,12 +40,12 @@ class Picture:
     """A picture of the page.
 
     Attributes:
-        name: of its place in the page, a word.
-        caption: what a reader should know of it.
-        alt: what it shows, for whoever cannot see it.
-        data: PNG or GIF.
-        size: width and height in pixels.
-        mime: of `data`.
+        name: Key of its place in the page.
+        caption: What a reader should know about it.
+        alt: Alternative text for people who cannot see it.
+        data: The bytes of a PNG or GIF file.
+        size: Width and height in pixels.
+        mime: MIME type of `data`.
     """
 
     name: str
@@ -57,29 +57,30 @@ class Picture:
 
 
 def most_different(paths: NDArray[Any], share: NDArray[Any], count: int = STROBES) -> tuple[int, NDArray[np.int64]]:
-    """The state from which some codes move most differently, and these codes.
+    """Find the state from which some codes move most differently, and these codes.
 
-    Two codes are as far apart as the body's positions are, each in units of its spread over all replays, root mean
-    square over time; after the end of either they count as equal. From each state the commonest code is taken, then
-    the one that is farthest from all before; the state is that in which the nearest two of them are farthest apart.
+    The distance between two codes is the root mean square over time of the difference between the body's positions,
+    each in units of its spread over all replays; after the end of either replay they count as equal. From each state
+    the commonest code is chosen first, then repeatedly the one farthest from those chosen; the state is that in which
+    the two nearest of them are farthest apart.
 
     Args:
         paths: (C, S, T + 1, P) positions under C codes from S states; NaN after a replay's end.
-        share: (C,) of the data.
-        count: how many codes; C at most.
+        share: (C,) each code's share of the data.
+        count: Number of codes; C at most.
 
     Returns:
-        The state's number, and the codes' rows, in their order.
+        The number of the state, and the rows of the codes, ascending.
     """
     moved = paths - paths[:, :, :1]
     scale = np.nanstd(moved, axis=(0, 1, 2))
     moved = moved / np.where(scale > 0, scale, 1.0)
     best: tuple[float, int, list[int]] = (-1.0, 0, [])
     for state in range(paths.shape[1]):
-        own = moved[:, state]  # (C, T + 1, P)
-        away = np.sqrt(np.square(np.nan_to_num(own[:, None] - own[None])).mean(axis=(2, 3)))  # (C, C)
+        at_state = moved[:, state]  # (C, T + 1, P)
+        away = np.sqrt(np.square(np.nan_to_num(at_state[:, None] - at_state[None])).mean(axis=(2, 3)))  # (C, C)
         chosen, least = [int(np.argmax(share))], np.inf
-        while len(chosen) < min(count, len(own)):
+        while len(chosen) < min(count, len(at_state)):
             nearest = away[:, chosen].min(axis=1)
             nearest[chosen] = -1.0
             chosen.append(int(nearest.argmax()))
@@ -88,18 +89,18 @@ def most_different(paths: NDArray[Any], share: NDArray[Any], count: int = STROBE
     return best[1], np.sort(best[2])
 
 
-class Studio:
-    """Makes the pictures of an atlas."""
+class AtlasPictures:
+    """Draws the pictures of an atlas."""
 
-    def __init__(self, task: Task, agent: DDSAgent, env: Any, seed: int, tell: Tell) -> None:
-        self.task, self.agent, self.env, self.seed, self.tell = task, agent, env, seed, tell
+    def __init__(self, task: Task, agent: DDSAgent, env: Any, seed: int, announce: Announce) -> None:
+        self.task, self.agent, self.env, self.seed, self.announce = task, agent, env, seed, announce
         self.pictures: dict[str, Picture] = {}
         self.clips: dict[int, Picture] = {}
         whole = max(round(view_of(task).held / task.step_seconds / agent.horizon), 1)
         self.steps = whole * agent.horizon
 
     def keep(self, name: str, figure: Figure, caption: str, alt: str) -> None:
-        """Keep a figure as a picture of the page."""
+        """Store a figure as a picture of the page."""
         width, height = (int(side * DPI) for side in figure.get_size_inches())
         self.pictures[name] = Picture(name, caption, alt, png_bytes(figure, DPI), (width, height))
 
@@ -110,65 +111,65 @@ class Studio:
             self.clips[code] = Picture(f"clip-{code}", "", alt, data, image.size, "image/gif")
 
     def skills(self, table: pd.DataFrame, used: NDArray[Any], drawn: BodyStates) -> None:
-        """What each skill does: trajectories or movement, and a clip of each."""
+        """Draw what each skill does: trajectories or movement, and a clip of each."""
         task, seconds = self.task, self.steps * self.task.step_seconds
-        self.tell("replaying the skills")
+        self.announce("replaying the skills")
         maze_like = task.maze_map is not None
         states = rest_states(task, junctions(task)) if maze_like else drawn
         made = replay_codes(
             task, self.agent.skill, states, used, self.steps, self.agent.noise_scale, self.seed, self.env
         )
-        self.tell("drawing the skills")
+        self.announce("drawing the skills")
         if maze_like:
             positions = made.qpos[..., :2]
             for code in used:
-                own = positions[made.codes == code]
-                words = f"Clip: skill {code} from {len(own)} places of the maze at once, {seconds:g} seconds."
-                self._clip(int(code), clip.replay_clip(task, own, int(code)), words)
+                of_code = positions[made.codes == code]
+                alt = f"Clip: skill {code} from {len(of_code)} places in the maze at once, {seconds:g} seconds."
+                self._clip(int(code), clip.replay_clip(task, of_code, int(code)), alt)
             shown = (positions[:, 0], positions, made.codes, made.alive)
             self.keep(
                 "starts_by_skill",
                 maze.plot_starts_by_skill(task, *shown),
-                f"One panel a skill: held for {seconds:g} s ({self.steps} steps) from {len(states)} places, the body "
-                "at rest. Orange stars are the starts.",
+                f"One panel per skill, held for {seconds:g} s ({self.steps} steps) from {len(states)} places, with the "
+                "body at rest. Orange stars mark the starts.",
                 f"{len(used)} small mazes, each with the paths of one skill from {len(states)} starts.",
             )
             self.keep(
                 "skills_by_start",
                 maze.plot_skills_by_start(task, *shown, reach=_reach(task, positions)),
-                "One panel a start, seen from near: every skill from the same place. A number is where it ended, or "
-                "left the panel.",
+                "One panel per start, in close-up: every skill from the same place. A number marks where the skill "
+                "ended or left the panel.",
                 f"{len(states)} close-ups of the maze, each with the paths of {len(used)} skills from one start.",
             )
         if view_of(task).limbs:
             self._movement(table, used, made, clips=not maze_like)
 
     def _movement(self, table: pd.DataFrame, used: NDArray[Any], made: Replays, clips: bool) -> None:
-        """Bodies under several skills from the same state: that in which they differ most."""
+        """Draw bodies under several skills from the same state, the one in which they differ most."""
         model = self.env.unwrapped.model
         share = table.set_index("code").loc[used, "share"].to_numpy()
         paths = made.qpos.reshape(len(used), -1, *made.qpos.shape[1:])  # (C, S, T + 1, nq)
         state, rows = most_different(paths, share)
         chosen = [int(code) for code in used[rows]]
-        own = made.take(made.states == state)
-        bodies = {int(code): body_frames(model, qpos) for code, qpos in zip(own.codes, own.qpos, strict=True)}
+        held = made.take(made.states == state)
+        bodies = {int(code): body_frames(model, qpos) for code, qpos in zip(held.codes, held.qpos, strict=True)}
         every = max(self.steps // view_of(self.task).bodies, 1)
         moments = (
-            f"a body every {every * self.task.step_seconds:.2g} s, the last one solid, lines are the ways of joints"
+            f"a body every {every * self.task.step_seconds:.2g} s, the last one solid; lines are the paths of joints"
         )
         self.keep(
             "strobe",
             strobe.plot_strobes(self.task, {code: bodies[code] for code in chosen}, every),
-            f"{len(chosen)} skills from the same state, that of {paths.shape[1]} in which they differ most: {moments}.",
+            f"{len(chosen)} skills from the state, of {paths.shape[1]}, in which they differ most: {moments}.",
             f"Stick figures of the body at several moments under skills {', '.join(map(str, chosen))}.",
         )
         if clips:
             for code, body in bodies.items():
-                words = f"Clip: the body under skill {code} for {self.steps * self.task.step_seconds:g} seconds."
-                self._clip(code, strobe.body_clip(self.task, body, code), words)
-        self.tell("rendering, if a graphics driver is there")
+                alt = f"Clip: the body under skill {code} for {self.steps * self.task.step_seconds:g} seconds."
+                self._clip(code, strobe.body_clip(self.task, body, code), alt)
+        self.announce("rendering, if there is a graphics driver")
         some = np.arange(0, self.steps + 1, every)
-        series = own.take(np.isin(own.codes, chosen))
+        series = held.take(np.isin(held.codes, chosen))
         rendered = render_frames(self.task, np.concatenate(series.qpos[:, some]))
         if rendered is not None:
             parts = np.cumsum(np.isfinite(series.qpos[:, some, 0]).sum(axis=1))[:-1]
@@ -176,18 +177,18 @@ class Studio:
             self.keep(
                 "rendered",
                 plot_rendered(self.task, frames, every),
-                "The same moments as MuJoCo renders them.",
+                "The same moments, rendered by MuJoCo.",
                 f"Rendered pictures of the body under skills {', '.join(map(str, chosen))}.",
             )
 
     def episodes(self, result: RolloutResult, main: str) -> None:
-        """How the policy strings skills together."""
-        self.tell("drawing episodes")
+        """Draw how the policy combines skills."""
+        self.announce("drawing episodes")
         figure = stitching.plot_stitching(self.task, result, main)
         self.keep(
             "stitching",
             figure,
-            "Each row of the timeline is an episode, each piece a skill in use, with its number where there is room.",
+            "Each row of the timeline is an episode, each segment a skill in use, with its number if there is room.",
             f"Timeline of the skills that {main} chose in several episodes"
             + (", and two of these episodes over the maze." if self.task.maze_map is not None else "."),
         )
@@ -200,26 +201,26 @@ class Studio:
             )
 
     def values(self) -> None:
-        """V and the policy over a maze."""
+        """Draw V and the policy over a maze."""
         if self.task.maze_map is None or self.agent.policy is None:
             return
-        self.tell("mapping values")
+        self.announce("mapping values")
         self.keep(
             "values",
             values.plot_policy_map(self.task, self.agent, self.steps, self.seed, self.env),
-            f"V of a body at rest. The number in a cell is the likeliest skill, the arrow where holding it for "
-            f"{self.steps} steps led from there. V should rise steadily along the way to the goal.",
+            f"V of a body at rest. The number in a cell is the likeliest skill, the arrow shows where holding it for "
+            f"{self.steps} steps led from there. V should rise steadily on the way to the goal.",
             "Heat map of the critic's value over the maze, in each cell the number and direction of the chosen skill.",
         )
 
     def diversity(self, table: pd.DataFrame) -> None:
-        """How much noise changes an action, and how much a code does."""
+        """Draw how much noise changes an action, and how much a code does."""
         self.keep(
             "diversity",
             charts.plot_diversity(table),
-            "The decoder's actions in the same states, 16 draws of noise each. Where the mark stands above the bar, "
-            "the code says more about the action than chance does.",
-            f"Bars of the spread over noise of {len(table)} codes, with marks for how far their actions lie apart.",
+            "The decoder's actions in the same states, 16 draws of noise each. If the mark is above the bar, the code "
+            "determines more of the action than chance does.",
+            f"Bars of the spread over noise of {len(table)} codes, with marks for how far apart their actions are.",
         )
 
     def matrices(
@@ -230,52 +231,51 @@ class Studio:
         distances: NDArray[Any],
         coded: CodedSegments,
     ) -> None:
-        """Tables between codes, and where each is used."""
+        """Draw the matrices between codes, and where each code is used."""
         count = len(recovery.codes)
         self.keep(
             "trip",
             charts.plot_round_trip(trip),
-            f"Round trip: {trip.segments} segments of the data for each code, the code held from the state in which "
-            "each begins, and what happened encoded again. The diagonal is what was found again.",
+            f"Round trip: for {trip.segments} segments of the data per code, the code is held from the state in which "
+            "each begins, and the resulting behaviour is encoded. The diagonal is the share that gets the same code.",
             f"Confusion matrix of {len(trip.codes)} codes: {trip.accuracy:.0%} found again, chance {trip.chance:.0%}.",
         )
         self.keep(
             "recovery",
             charts.plot_recovery(recovery),
             f"Recovery: {count} codes, each held for {recovery.steps} steps from the same {recovery.states} states, "
-            "wherever the data have been. Equal rows: there the state decides, not the code.",
+            "drawn from all of the data. Equal rows mean that the state decides, not the code.",
             f"Confusion matrix of {count} codes: {recovery.accuracy:.0%} recovered, chance {recovery.chance:.0%}.",
         )
         self.keep(
             "effects",
             charts.plot_effects(self.task, recovery),
-            f"The same replays: where each leads in {recovery.steps} steps, less the mean of all skills from that "
-            "state, because a body that moves goes on moving whatever it is told. A dot is a replay, a number the mean "
-            "of its skill.",
+            f"The same replays: displacement in {recovery.steps} steps minus the mean of all skills from that state, "
+            "because a moving body keeps moving under any skill. A dot is a replay, a number the mean of its skill.",
             f"Displacements under {count} codes as clouds of dots with the code's number in the middle of each.",
         )
         self.keep(
             "transitions",
             charts.plot_transitions(transitions),
-            "Per cent of a code's segments that are followed by a segment of each code.",
+            "Percentage of a code's segments that are followed by a segment of each code.",
             "Matrix of how often each code follows each other code in the data.",
         )
         self.keep(
             "distances",
             charts.plot_distances(distances),
-            "Codes with near vectors tend to do alike things.",
+            "Codes whose vectors are close tend to behave similarly.",
             "Matrix of the distances between the codebook's vectors.",
         )
-        words = "A square is told where at least five segments begin." if self.task.maze_map is not None else ""
+        squares = "A square is shown if at least five segments begin in it." if self.task.maze_map is not None else ""
         self.keep(
             "where",
             charts.plot_where(self.task, coded),
-            f"From {len(coded.codes):,} segments of the data, one every {self.agent.horizon} steps. {words}",
-            "One panel a code: where in the state space the data's segments with that code begin.",
+            f"From {len(coded.codes):,} segments of the data, one every {self.agent.horizon} steps. {squares}",
+            "One panel per code: where in the state space the data's segments with that code begin.",
         )
 
 
 def _reach(task: Task, positions: NDArray[Any]) -> float:
-    """Half a window's side in metres in which nine of ten replays (N, T + 1, 2) stay, half a cell to two and a half."""
+    """Return half the side, in metres, of a window in which 90 % of replays (N, T + 1, 2) stay; 0.5 to 2.5 cells."""
     away = np.nanmax(np.linalg.norm(positions - positions[:, :1], axis=-1), axis=1)
     return float(np.clip(1.2 * np.quantile(away, 0.9), 0.5 * task.cell_size, maze.REACH * task.cell_size))

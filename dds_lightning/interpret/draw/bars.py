@@ -1,4 +1,4 @@
-"""Scores as bars, for tasks that have no maze to draw."""
+"""Scores as bars, for tasks without a maze to draw."""
 
 import textwrap
 
@@ -10,20 +10,20 @@ from dds_lightning.interpret.draw.drawing import LABEL, TICKS
 from dds_lightning.interpret.draw.palette import NO_SKILL, SKILL_COLOURS
 
 WRAP = 40
-"""Letters of a contestant's name on one line."""
+"""Maximum number of letters of a contestant's name on one line."""
 
 
 def plot_scores(summary: pd.DataFrame) -> Figure:
-    """Normalised score of every contestant and of every single skill, with its standard error.
+    """Draw the normalised score of every contestant and of every single skill, with its standard error.
 
     Args:
-        summary: columns `contestant`, `kind` ("skill" for a single skill's row), `score`, `score_error`.
+        summary: Columns `contestant`, `kind` ("skill" for a single skill's row), `score`, `score_error`.
     """
-    rows = summary.iloc[::-1]  # bars are drawn from below
+    rows = summary.iloc[::-1]  # bars are drawn from the bottom
     names = [textwrap.fill(str(name), WRAP) for name in rows["contestant"]]
     colours = [NO_SKILL if kind == "skill" else SKILL_COLOURS[0] for kind in rows["kind"]]
     lines = np.array([name.count("\n") + 1 for name in names])
-    places = np.cumsum(lines) - lines / 2  # a long name takes its room
+    places = np.cumsum(lines) - lines / 2  # a long name takes more room
     figure = Figure(figsize=(7.0, 0.7 + 0.19 * lines.sum()), layout="constrained")
     ax = figure.add_subplot()
     errors = rows["score_error"].fillna(0.0)

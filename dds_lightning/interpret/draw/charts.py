@@ -33,17 +33,17 @@ if TYPE_CHECKING:
     from dds_lightning.interpret.measure.statistics import CodedSegments
 
 SHADES = LinearSegmentedColormap.from_list("shades", ["#eef3fa", "#9cc3e6", "#3b82c4", "#0b3d75", "#04142b"])
-"""From little to much, in one hue: light where there is nothing, so that ink goes where there is something."""
+"""One hue from low to high: light where there is nothing, so that ink goes where there is something."""
 NUMBERED = 24
-"""Codes up to which a matrix has its numbers written in."""
+"""Maximum number of codes for which a matrix shows its numbers."""
 SQUARES = 3
-"""Squares a maze's cell on each axis, for where a code is used."""
+"""Squares per cell of a maze on each axis, for where a code is used."""
 BAR = 0.45
-"""Inches of a colour bar below some panels, with its label."""
+"""Height in inches of a colour bar below some panels, with its label."""
 SEEN = 5
-"""Segments that a square needs to be told."""
+"""Minimum number of segments in a square for it to be shown."""
 DOTS = 400
-"""Points of one code that are drawn where there is no maze."""
+"""Maximum number of points per code, without a maze."""
 
 
 def plot_matrix(
@@ -57,18 +57,18 @@ def plot_matrix(
     hide: float = 0.5,
     unit: str = "%",
 ) -> Figure:
-    """A square matrix between codes as a heat map, with its numbers.
+    """Draw a square matrix between codes as a heat map, with its numbers.
 
     Args:
         matrix: (C, C); NaN is left white.
-        codes: (C,) of rows and columns.
-        xlabel: what the columns are.
-        ylabel: what the rows are.
-        title: of the figure.
-        form: of the numbers, times `factor`.
+        codes: (C,) codes of rows and columns.
+        xlabel: Label of the columns.
+        ylabel: Label of the rows.
+        title: Title of the figure.
+        form: Format of the numbers, which are multiplied by `factor`.
         factor: 100 for shares in per cent.
-        hide: numbers (times `factor`) below this are not written.
-        unit: of the colour bar.
+        hide: Numbers (times `factor`) below this are not written.
+        unit: Unit of the colour bar.
     """
     size = len(matrix)
     side = float(np.clip(0.36 * size + 1.4, 3.4, 7.0))
@@ -100,26 +100,28 @@ def plot_matrix(
 
 
 def plot_recovery(found: Recovery) -> Figure:
-    """The confusion matrix of `recovery.code_recovery`, accuracy and chance in its title."""
+    """Draw the confusion matrix of `recovery.code_recovery`, with accuracy and chance in its title."""
     title = f"From any state: recovered in {found.accuracy:.0%} (chance {found.chance:.0%})"
     return plot_matrix(found.confusion, found.codes, "code that the encoder finds", "code that was held", title)
 
 
 def plot_round_trip(found: RoundTrip) -> Figure:
-    """The confusion matrix of `recovery.round_trip`, accuracy, control and chance in its title."""
+    """Draw the confusion matrix of `recovery.round_trip`, with accuracy, control and chance in its title."""
     control = "" if np.isnan(found.control) else f", another code held {found.control:.0%}"
     title = f"In its own states: found again in {found.accuracy:.0%}\n(chance {found.chance:.0%}{control})"
     return plot_matrix(found.confusion, found.codes, "code that the encoder finds", "code that was held", title)
 
 
 def plot_transitions(matrix: NDArray[Any]) -> Figure:
-    """The matrix of `statistics.transition_matrix`."""
+    """Draw the matrix of `statistics.transition_matrix`."""
     codes = np.arange(len(matrix))
-    return plot_matrix(matrix, codes, "code of the next segment", "code of a segment", "What follows what in the data")
+    return plot_matrix(
+        matrix, codes, "code of the next segment", "code of a segment", "Which code follows which in the data"
+    )
 
 
 def plot_distances(distances: NDArray[Any]) -> Figure:
-    """The matrix of `statistics.code_distances`."""
+    """Draw the matrix of `statistics.code_distances`."""
     shown = np.asarray(distances, dtype=float).copy()
     np.fill_diagonal(shown, np.nan)
     title = "Distance between the codebook's vectors"
@@ -127,11 +129,11 @@ def plot_distances(distances: NDArray[Any]) -> Figure:
 
 
 def plot_effects(task: Task, found: Recovery) -> Figure:
-    """What each code does to the displacement, a dot a state and the code's number at its mean.
+    """Draw the effect of each code on the displacement, one dot per state and the code's number at their mean.
 
     Args:
-        task: where it was measured.
-        found: of `recovery.code_recovery`.
+        task: The task in which it was measured.
+        found: Result of `recovery.code_recovery`.
     """
     names = view_of(task).path
     across, up = 0, len(names) - 1
@@ -143,7 +145,7 @@ def plot_effects(task: Task, found: Recovery) -> Figure:
     for code, dots in zip(found.codes, effects, strict=True):
         draw_number(ax, np.nanmean(dots, axis=0), int(code))
     ax.set_aspect("equal", adjustable="datalim")
-    ax.set_xlabel(f"{names[across]}, less the mean of all skills (cm)", fontsize=LABEL - 1)
+    ax.set_xlabel(f"{names[across]}, minus the mean of all skills (cm)", fontsize=LABEL - 1)
     ax.set_ylabel(f"{names[up]} (cm)", fontsize=LABEL - 1)
     ax.tick_params(labelsize=TICKS - 1.5)
     ax.set_title(
@@ -155,10 +157,10 @@ def plot_effects(task: Task, found: Recovery) -> Figure:
 
 
 def plot_diversity(table: pd.DataFrame) -> Figure:
-    """How much noise alone changes an action, and how much the code does, one bar and one mark a code.
+    """Draw how much noise alone changes an action, and how much the code does, one bar and one mark per code.
 
     Args:
-        table: of `statistics.decoder_diversity`, or any with its columns.
+        table: Table from `statistics.decoder_diversity`, or any table with its columns.
     """
     figure = Figure(figsize=(7.0, 2.6), layout="constrained")
     ax = figure.add_subplot()
@@ -177,7 +179,7 @@ def plot_diversity(table: pd.DataFrame) -> Figure:
     ax.spines[["top", "right"]].set_visible(False)
     handles = [
         Patch(facecolor=NO_SKILL, label="spread of its actions over noise"),
-        Line2D([], [], **mark, label="its mean action from that of all skills"),
+        Line2D([], [], **mark, label="distance of its mean action from that of all skills"),
     ]
     place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.0}
     ax.legend(handles=handles, fontsize=9, frameon=False, ncols=2, **place)
@@ -185,14 +187,14 @@ def plot_diversity(table: pd.DataFrame) -> Figure:
 
 
 def plot_where(task: Task | None, segments: CodedSegments) -> Figure:
-    """Where in the state space each code is used in the data, one panel a code.
+    """Draw where in the state space each code is used in the data, one panel per code.
 
     In a maze: the share of the segments that begin in a square and have the code. Elsewhere: the code's segments over
-    all others, along the two numbers of an observation by which codes are told apart best.
+    all others, along the two dimensions of the observations that distinguish codes best.
 
     Args:
-        task: what the data are of.
-        segments: of `statistics.code_segments`.
+        task: The task of the data.
+        segments: Segments from `statistics.code_segments`.
     """
     if task is not None and task.maze_map is not None:
         return _where_in_maze(task, segments)
@@ -205,9 +207,9 @@ def plot_where(task: Task | None, segments: CodedSegments) -> Figure:
     some = rng.permutation(len(seen))[: 4 * DOTS]
     limits = [np.quantile(seen[:, j], (0.002, 0.998)) for j in (across, up)]
     for ax, code in zip(axes, shown, strict=True):
-        own = rng.permutation(np.flatnonzero(codes == code))[:DOTS]
+        dots = rng.permutation(np.flatnonzero(codes == code))[:DOTS]
         ax.plot(*seen[some][:, [across, up]].T, ".", color=WALL, markersize=2, zorder=1, rasterized=True)
-        ax.plot(*seen[own][:, [across, up]].T, ".", color=skill_colour(int(code)), markersize=2.5, rasterized=True)
+        ax.plot(*seen[dots][:, [across, up]].T, ".", color=skill_colour(int(code)), markersize=2.5, rasterized=True)
         ax.set(xlim=limits[0], ylim=limits[1])
         ax.tick_params(labelsize=TICKS - 3)
         ax.label_outer()
@@ -248,10 +250,10 @@ def _where_in_maze(task: Task, segments: CodedSegments) -> Figure:
 
 
 def plot_comparison(table: pd.DataFrame) -> Figure:
-    """Recovery, information and decoding error of several models, a dot a seed, the mean as a bar.
+    """Draw recovery, information and decoding error of several models, one dot per seed and a bar for the mean.
 
     Args:
-        table: of `recovery.compare_recovery`.
+        table: Table from `recovery.compare_recovery`.
     """
     names = list(dict.fromkeys(table["model"]))
     figure = Figure(figsize=(7.0, 2 * (0.5 * len(names) + 1.25)), layout="constrained")
@@ -259,10 +261,10 @@ def plot_comparison(table: pd.DataFrame) -> Figure:
         ("own_accuracy", 100.0, "found again in\nits own states (%)", "own_control", "another code held"),
         ("accuracy", 100.0, "recovered from\nany state (%)", "chance", "chance"),
         ("information_in_state", 1.0, "information about\nwhere it leads (bits)", "most", "most possible"),
-        ("decoded", 1.0, "error of decoded actions\n(root mean square)", "decoded_own", "each segment's own vector"),
+        ("decoded", 1.0, "error of decoded actions\n(root mean square)", "decoded_own", "each segment's vector"),
     )
     axes = figure.subplots(2, 2, sharey=True).ravel()
-    for ax, (column, factor, label, line, words) in zip(axes, columns, strict=True):
+    for ax, (column, factor, label, line, line_label) in zip(axes, columns, strict=True):
         for place, name in enumerate(names):
             rows = table[table["model"] == name]
             colour = SKILL_COLOURS[0 if rows["kind"].iloc[0] == "discrete" else 9]
@@ -271,7 +273,7 @@ def plot_comparison(table: pd.DataFrame) -> Figure:
             ax.plot(factor * rows[column], place + spread, "o", color=colour, markersize=5)
             mark = factor * rows[line].mean()
             ax.plot([mark, mark], [place - 0.38, place + 0.38], color=NO_SKILL, linestyle="--", linewidth=1.3)
-        ax.plot([], [], color=NO_SKILL, linestyle="--", linewidth=1.3, label=words)
+        ax.plot([], [], color=NO_SKILL, linestyle="--", linewidth=1.3, label=line_label)
         ax.set_xlabel(label, fontsize=LABEL - 2)
         ax.tick_params(labelsize=TICKS - 1.5)
         ax.spines[["top", "right"]].set_visible(False)

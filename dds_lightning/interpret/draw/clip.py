@@ -1,7 +1,7 @@
 """A short clip of an episode in a maze, drawn without any graphics driver.
 
 The walls are drawn once; every frame starts from that picture, adds what moved, and shares one colour table with the
-others. That makes it fast and the file small, which no animation writer of a library does (see `gif`).
+others. That is fast and keeps the file small, unlike the animation writers of plotting libraries (see `gif`).
 """
 
 from pathlib import Path
@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from dds_lightning.interpret.draw.drawing import draw_starts, draw_walls, extent
-from dds_lightning.interpret.draw.gif import Still, gif_bytes
+from dds_lightning.interpret.draw.gif import CachedBackground, gif_bytes
 from dds_lightning.interpret.draw.palette import ink, skill_colour
 from dds_lightning.rollout.result import RolloutPath
 from dds_lightning.saving.files import written_whole
@@ -26,12 +26,12 @@ def write_clip(
     """Write an episode as an animated GIF: the walls, the body, its trail coloured by the skill in use.
 
     Args:
-        path: the file to write.
-        task: the maze.
-        episode: the path to show.
-        title: one line above the maze.
-        frames: at most this many frames; the episode is thinned to fit.
-        fps: frames a second.
+        path: The file to write.
+        task: The maze.
+        episode: The path to show.
+        title: Line of text above the maze.
+        frames: Maximum number of frames; the episode is subsampled to fit.
+        fps: Frames per second.
     """
     positions, codes = np.asarray(episode.positions), np.asarray(episode.codes)
     shown = np.unique(np.linspace(1, len(codes), min(frames, len(codes))).round().astype(int))
@@ -47,7 +47,7 @@ def write_clip(
     ax.add_collection(trail)
     (body,) = ax.plot([], [], "o", markersize=13, markeredgecolor="black", markeredgewidth=0.8, zorder=6)
     number = ax.text(0.0, 0.0, "", fontsize=7.5, ha="center", va="center", zorder=7)
-    still = Still(figure, (trail, body, number, caption))
+    background = CachedBackground(figure, (trail, body, number, caption))
 
     pieces = np.stack([positions[:-1], positions[1:]], axis=1)  # (T, 2, 2)
     colours = [skill_colour(int(code)) for code in codes]
@@ -62,7 +62,7 @@ def write_clip(
         number.set_position((float(positions[t][0]), float(positions[t][1])))
         number.set(text=str(code) if code >= 0 else "", color=ink(colour))
         caption.set_text((f"skill {code:2d}   " if code >= 0 else "") + f"step {t:3d}")
-        images.append(still.frame())
+        images.append(background.frame())
     path = Path(path)
     with written_whole(path) as part:
         part.write_bytes(gif_bytes(images, fps))
@@ -72,15 +72,15 @@ def write_clip(
 def replay_clip(
     task: Task, positions: NDArray[Any], code: int, frames: int = 30, fps: int = 12, size: float = 2.9
 ) -> bytes:
-    """One skill from several starts of a maze at once, as an animated GIF.
+    """Encode one skill from several starts of a maze at once as an animated GIF.
 
     Args:
-        task: the maze.
+        task: The maze.
         positions: (N, T + 1, 2) metres; a replay that has ended (NaN) stays where it was.
-        code: of the skill; gives the colour.
-        frames: at most this many pictures.
-        fps: pictures a second.
-        size: width in inches at 80 dots an inch.
+        code: The skill's code, which determines the colour.
+        frames: Maximum number of frames.
+        fps: Frames per second.
+        size: Width in inches at 80 dots per inch.
     """
     positions = np.asarray(positions, dtype=float)
     known = np.isfinite(positions[..., 0])
@@ -99,11 +99,11 @@ def replay_clip(
     ax.add_collection(trails)
     (bodies,) = ax.plot([], [], "o", color=skill_colour(code), markersize=5, markeredgecolor="black", zorder=6)
     caption = figure.text(0.03, 1 - 0.08 / tall, "", fontsize=8.5, va="top")
-    still = Still(figure, (trails, bodies, caption))
+    background = CachedBackground(figure, (trails, bodies, caption))
     pictures = []
     for t in shown:
         trails.set_segments(list(positions[:, : t + 1]))
         bodies.set_data(*positions[:, t].T)
         caption.set_text(f"skill {code}   {t * task.step_seconds:4.2f} s")
-        pictures.append(still.frame())
+        pictures.append(background.frame())
     return gif_bytes(pictures, fps, colours=64)

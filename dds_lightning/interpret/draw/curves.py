@@ -1,4 +1,4 @@
-"""Training curves from the metrics.csv that every fit leaves."""
+"""Training curves from the metrics.csv that every fit writes."""
 
 from pathlib import Path
 
@@ -23,15 +23,15 @@ PANELS = {
 
 
 def read_metrics(path: str | Path) -> pd.DataFrame:
-    """Read a metrics.csv, one row a logged step."""
+    """Read a metrics.csv, one row per logged step."""
     return pd.read_csv(path).sort_values("step")
 
 
 def plot_training_curves(stages: dict[str, Path]) -> Figure:
-    """Curves of each stage that has a metrics file, one row of panels a stage.
+    """Draw the curves of each stage that has a metrics file, one row of panels per stage.
 
     Args:
-        stages: "skill" or "policy" to its metrics.csv; missing files are left out.
+        stages: "skill" or "policy" -> its metrics.csv; missing files are left out.
     """
     present = {stage: read_metrics(path) for stage, path in stages.items() if path.is_file()}
     figure = Figure(figsize=(8.0, 2.1 * max(len(present), 1)), layout="constrained")
@@ -68,5 +68,5 @@ def _curve(ax: Axes, table: pd.DataFrame, column: str, label: str) -> None:
             linewidth=1.2,
             marker="." if len(points) < 12 else "",
         )
-        if column.endswith("codes_used"):  # a count: from none
+        if column.endswith("codes_used"):  # a count starts at zero
             ax.set_ylim(bottom=0.0)

@@ -1,6 +1,6 @@
-"""One figure of a data set: lengths and returns of its episodes, its actions, and where in a maze it has been.
+"""One figure of a data set: lengths and returns of its episodes, its actions, and the visited places of a maze.
 
-Sizes are for 7 inches of width, as those of the other figures.
+The figure is 7 inches wide, like the others.
 """
 
 from collections.abc import Iterator
@@ -26,10 +26,10 @@ LABEL, TICKS = 10.0, 9.0
 WIDTH, TITLE = 7.0, 0.3
 """Inches."""
 BARS = 30
-"""Bars of a histogram, at most."""
+"""Maximum number of bars in a histogram."""
 ACTION_BARS = 41
 SQUARES = 8
-"""Squares a maze's cell on each axis, for the visits."""
+"""Squares per cell of a maze on each axis, for the visits."""
 TRUNCATED, TERMINATED = SKILL_COLOURS[0], SKILL_COLOURS[6]
 
 
@@ -37,9 +37,9 @@ def plot_dataset(trajectories: Trajectories, task: Task | None = None) -> Figure
     """Draw what is in a data set.
 
     Args:
-        trajectories: the data; as they are, so load them with the task to see its rewards.
-        task: adds the score to the returns, names to the actions and, for mazes, a map of the visited places;
-            in the kitchen returns give way to the subtasks that were done.
+        trajectories: The data; they are drawn as they are, so load them with the task to see its rewards.
+        task: Adds the score to the returns, names to the actions and, for mazes, a map of the visited places;
+            in the kitchen the subtasks that were done replace the returns.
     """
     if task is not None and task.maze_map is not None:
         rows, columns = len(task.maze_map), len(task.maze_map[0])
@@ -72,7 +72,7 @@ def plot_dataset(trajectories: Trajectories, task: Task | None = None) -> Figure
 def _panels(
     actions: int, mosaic: list[list[str]], height: float, widths: tuple[float, ...]
 ) -> tuple[Figure, dict[str, Axes]]:
-    """A figure with some panels in `height` inches and, below them, room for so many actions."""
+    """Create a figure with some panels in `height` inches and, below them, room for the actions."""
     below = 0.24 * actions + 0.6
     figure = Figure(figsize=(WIDTH, height + below + TITLE), layout="constrained")
     upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=[height, below]).ravel()
@@ -91,12 +91,12 @@ def _draw_visits(ax: Axes, trajectories: Trajectories, task: Task) -> None:
     mesh = ax.pcolormesh(x, y, seen, cmap="viridis_r", norm=norm, zorder=0.5, rasterized=True)
     draw_starts(ax, [task.start_xy()], task.cell_size, size=14)
     bar = ax.figure.colorbar(mesh, ax=ax, location="bottom", shrink=0.9, aspect=40, pad=0.02, format="%d")
-    bar.set_label(f"visits of a square of {task.cell_size / SQUARES:g} m (white: none)", fontsize=LABEL)
+    bar.set_label(f"visits per square of {task.cell_size / SQUARES:g} m (white: none)", fontsize=LABEL)
     bar.ax.tick_params(labelsize=TICKS)
 
 
 def _draw_lengths(ax: Axes, trajectories: Trajectories, task: Task | None) -> None:
-    """Episodes by length, those that the task ended upon those that only the recording ended."""
+    """Draw episodes by length, with those that the task ended on top of those that the recording cut off."""
     lengths = trajectories.lengths
     terminated = trajectories.terminations[trajectories.step_offsets[1:] - 1]
     width = int(np.ceil((lengths.max() + 1) / BARS))
@@ -131,7 +131,7 @@ def _draw_returns(ax: Axes, trajectories: Trajectories, task: Task | None) -> No
 
 
 def _draw_reached(ax: Axes, trajectories: Trajectories) -> None:
-    """How many episodes of a maze reach the goal: their returns are 1 or 0."""
+    """Draw how many episodes of a maze reach the goal: their returns are 1 or 0."""
     reached = int((trajectories.returns > 0).sum())
     counts = [trajectories.num_episodes - reached, reached]
     _bars(ax, ["no", "yes"], counts, [TRUNCATED, TERMINATED])
@@ -139,20 +139,20 @@ def _draw_reached(ax: Axes, trajectories: Trajectories) -> None:
 
 
 def _draw_subtasks(number: Axes, share: Axes, trajectories: Trajectories, task: Task) -> None:
-    """How many subtasks an episode does, at any time, and which: what its environment pays for."""
+    """Draw how many subtasks an episode completes, at any time, and which, as its environment rewards them."""
     done = np.concatenate([subtasks_done(block, task.subtasks) for block in _blocks(trajectories.observations)])
     done[trajectories.observation_offsets[:-1]] = False  # no step leads to an episode's first state
     ever = np.logical_or.reduceat(done, trajectories.observation_offsets[:-1], axis=0)  # (E, M)
     total = len(task.subtasks)
     number.bar(range(total + 1), np.bincount(ever.sum(axis=1), minlength=total + 1), color=TRUNCATED)
-    number.set(xlabel="subtasks an episode does", ylabel="episodes", xticks=range(total + 1))
+    number.set(xlabel="subtasks completed in an episode", ylabel="episodes", xticks=range(total + 1))
     number.yaxis.set_major_locator(MaxNLocator(integer=True, nbins=4))
     _bars(share, list(task.subtasks)[::-1], [int(count) for count in ever.sum(axis=0)[::-1]], [TRUNCATED] * total)
-    share.set(xlabel="episodes that do it")
+    share.set(xlabel="episodes that complete it")
 
 
 def _bars(ax: Axes, labels: list[str], counts: list[int], colours: list[str]) -> None:
-    """Horizontal bars with their counts."""
+    """Draw horizontal bars with their counts."""
     bars = ax.barh(labels, counts, color=colours, height=0.65)
     ax.bar_label(bars, labels=[f"{count:,}" for count in counts], padding=3, fontsize=TICKS)
     ax.set(xlim=(0, max(max(counts), 1) * 1.3))
@@ -160,10 +160,10 @@ def _bars(ax: Axes, labels: list[str], counts: list[int], colours: list[str]) ->
 
 
 def _draw_actions(ax: Axes, trajectories: Trajectories, task: Task | None) -> None:
-    """A row with a histogram for every entry of the actions, and the share of steps at its bounds.
+    """Draw a row with a histogram for every entry of the actions, and the share of steps at its bounds.
 
-    A controller that saturates has spikes at the bounds that would dwarf all else: a row's scale is that of
-    the bars between, and what is higher is cut.
+    A controller that saturates has spikes at the bounds that would dwarf everything else: a row is scaled to the bars
+    in between, and higher bars are cut off.
     """
     low, high = trajectories.action_low, trajectories.action_high
     counts, at_bounds = _action_counts(trajectories)
@@ -185,11 +185,11 @@ def _draw_actions(ax: Axes, trajectories: Trajectories, task: Task | None) -> No
         ax.set(xticks=ticks, xticklabels=[f"{low[0] + (tick + 1) / 2 * (high[0] - low[0]):g}" for tick in ticks])
     else:
         ax.set(xticks=(-1, 1), xticklabels=("lower bound", "upper bound"))
-    ax.set(xlabel="action (each row to its own scale)")
+    ax.set(xlabel="action (each row has its own scale)")
 
 
 def _action_counts(trajectories: Trajectories) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Histogram (A, ACTION_BARS) of each action entry over its box, and the share (A,) of steps at a bound."""
+    """Return a histogram (A, ACTION_BARS) of each action entry over its box, and the share (A,) of steps at a bound."""
     low, span = trajectories.action_low, trajectories.action_high - trajectories.action_low
     width = trajectories.action_dim
     counts = np.zeros(width * ACTION_BARS, np.int64)
@@ -203,7 +203,7 @@ def _action_counts(trajectories: Trajectories) -> tuple[NDArray[np.int64], NDArr
 
 
 def _head_room(ax: Axes) -> None:
-    """Room for a legend above the bars."""
+    """Leave room for a legend above the bars."""
     bottom, top = ax.get_ylim()
     ax.set_ylim(bottom, bottom + 1.35 * (top - bottom))
 

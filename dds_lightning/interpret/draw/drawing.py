@@ -1,7 +1,7 @@
-"""What every figure over a maze is made of: walls, paths, the start's star, the number of a skill.
+"""The elements of every figure over a maze: walls, paths, the star of the start, the number of a skill.
 
-A maze is seen from above with y up, as the simulator has it: a left turn is a left turn. Where y grows down the map
-(D4RL's AntMaze) the map's first row is therefore the lowest.
+A maze is seen from above with y up, as in the simulator: a left turn is a left turn. If y grows down the map (D4RL's
+AntMaze), the map's first row is therefore the lowest.
 """
 
 from collections.abc import Iterable
@@ -21,19 +21,19 @@ from dds_lightning.rollout.result import RolloutPath
 from dds_lightning.tasks import Task
 
 LABEL, TICKS, NUMBER = 12.0, 11.0, 9.0
-"""Font sizes of a figure 7 inches wide: printed over one column of 3.5 inches they are half of this."""
+"""Font sizes of a figure 7 inches wide: printed in a column of 3.5 inches they are halved."""
 
 CROPPED = 0.6
-"""Cells of the outer wall that small panels leave out on each side."""
+"""How much of the outer wall, in cells, small panels leave out on each side."""
 
 
 def draw_walls(ax: Axes, task: Task, goal: bool = True) -> None:
-    """Draw the maze, one square a wall cell, with axes in metres and where the goal counts as reached.
+    """Draw the maze, one square per wall cell, with axes in metres and the area in which the goal counts as reached.
 
-    That is a circle, or, where every episode draws its goal, all the circles there can be.
+    That is a circle, or, if every episode draws its goal, the union of all possible circles.
 
     Raises:
-        UserError: the task has no maze.
+        UserError: The task has no maze.
     """
     if task.maze_map is None:
         raise UserError(f"task '{task.name}' has no maze to draw; use the table of its report instead")
@@ -57,9 +57,9 @@ def draw_walls(ax: Axes, task: Task, goal: bool = True) -> None:
 
 
 def goal_outline(task: Task, points: int = 120) -> NDArray[np.float64]:
-    """The edge (P, 2) in metres of all places within the goal's radius of a goal.
+    """Return the outline (P, 2) in metres of all places within the goal's radius of a goal.
 
-    A circle round the one goal, a square with round corners where goals are drawn from a square.
+    A circle around a fixed goal; a square with round corners if goals are drawn from a square.
     """
     angles = (np.arange(points) + 0.5) * 2 * np.pi / points
     outwards = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
@@ -67,7 +67,7 @@ def goal_outline(task: Task, points: int = 120) -> NDArray[np.float64]:
 
 
 def extent(task: Task) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Left and right, bottom and top of a maze in metres."""
+    """Return left and right, bottom and top of a maze in metres."""
     assert task.maze_map is not None
     corners = task.cell_to_xy([(0, 0), (len(task.maze_map) - 1, len(task.maze_map[0]) - 1)])
     (left, bottom), (right, top) = corners.min(axis=0), corners.max(axis=0)
@@ -89,10 +89,10 @@ def draw_path(ax: Axes, path: RolloutPath, linewidth: float = 1.0, numbers: floa
     """Draw one path coloured by the skill in use.
 
     Args:
-        ax: a maze.
-        path: positions and codes.
-        linewidth: in points.
-        numbers: write each code where it takes over if that is this far (metres) from every other; 0 for none.
+        ax: Axes that show a maze.
+        path: Positions and codes.
+        linewidth: Line width in points.
+        numbers: Minimum distance in metres between the numbers written where a code takes over; 0 writes none.
     """
     positions, codes = np.asarray(path.positions), np.asarray(path.codes)
     pieces = np.stack([positions[:-1], positions[1:]], axis=1)  # (T, 2, 2)
@@ -100,7 +100,7 @@ def draw_path(ax: Axes, path: RolloutPath, linewidth: float = 1.0, numbers: floa
     lines = LineCollection(list(pieces), colors=colours, linewidths=linewidth, zorder=2, capstyle="round")
     ax.add_collection(lines)
     if numbers:
-        written = positions[:1]  # the star is there; numbers on top of each other or of it tell nothing
+        written = positions[:1]  # the star is there; overlapping numbers would be unreadable
         for t in np.flatnonzero(np.diff(codes, prepend=codes[0] - 1)):
             if np.linalg.norm(positions[t] - written, axis=1).min() >= numbers:
                 written = np.concatenate([written, positions[t : t + 1]])
@@ -122,7 +122,7 @@ def draw_number(ax: Axes, xy: NDArray[Any], code: int, size: float = NUMBER) -> 
 
 
 def draw_starts(ax: Axes, starts: Iterable[NDArray[Any]], cell: float, size: float = 12.0) -> None:
-    """Orange stars, one for all starts closer than half a cell to it."""
+    """Draw orange stars, one for all starts within half a cell of each other."""
     drawn: list[NDArray[Any]] = []
     for start in starts:
         if all(np.linalg.norm(start - other) >= cell / 2 for other in drawn):
@@ -133,7 +133,7 @@ def draw_starts(ax: Axes, starts: Iterable[NDArray[Any]], cell: float, size: flo
 
 
 def grid(count: int, width: float, height: float, columns: int = 4) -> tuple[Figure, list[Axes]]:
-    """A figure of ``count`` equal panels, at most ``columns`` in a row; the list has only these."""
+    """Create a figure of ``count`` equal panels, at most ``columns`` in a row; the list has only these."""
     columns = max(min(columns, count), 1)
     rows = max(-(-count // columns), 1)
     figure = Figure(figsize=(columns * width, rows * height + 0.45), layout="constrained")
@@ -145,32 +145,32 @@ def grid(count: int, width: float, height: float, columns: int = 4) -> tuple[Fig
 
 
 def panel_height(task: Task, width: float) -> float:
-    """Height in inches of a panel that shows a cropped maze under a heading."""
+    """Return the height in inches of a panel that shows a cropped maze under a heading."""
     return width * _proportion(task, CROPPED) + 0.25
 
 
 def crop(ax: Axes, task: Task) -> None:
-    """Leave out most of the outer wall: a small panel needs the room."""
+    """Crop most of the outer wall, because a small panel needs the room."""
     (left, right), (bottom, top) = extent(task)
     less = CROPPED * task.cell_size
     ax.set(xlim=(left + less, right - less), ylim=(bottom + less, top - less))
 
 
 def maze_figure(task: Task) -> tuple[Figure, Axes]:
-    """A figure 7 inches wide with one maze and room for a legend or a colour bar beside it."""
+    """Create a figure 7 inches wide with one maze and room for a legend or a colour bar beside it."""
     figure = Figure(figsize=(7.0, 5.1 * _proportion(task) + 0.9), layout="constrained")
     return figure, figure.add_subplot()
 
 
 def _proportion(task: Task, cropped: float = 0.0) -> float:
-    """Height of a maze over its width, without so many cells on each side."""
+    """Return the height of a maze divided by its width, without some cells on each side."""
     (left, right), (bottom, top) = extent(task)
     less = 2 * cropped * task.cell_size
     return (top - bottom - less) / (right - left - less)
 
 
 def heading(ax: Axes, code: int, text: str = "") -> None:
-    """A panel's skill: its number on its colour, as on the paths of the other figures, then some words."""
+    """Write a panel's heading: the skill's number on its colour, as on paths in other figures, then some text."""
     colour = skill_colour(code)
     box = {"boxstyle": "round,pad=0.2", "facecolor": colour, "edgecolor": "none"}
     put = partial(
@@ -182,7 +182,7 @@ def heading(ax: Axes, code: int, text: str = "") -> None:
 
 
 def frame(figure: Figure, axes: Iterable[Axes], task: Task, title: str) -> None:
-    """For panels too small for axes: no ticks, the scale in the title."""
+    """Finish panels that are too small for axes: no ticks, the scale in the title."""
     for ax in axes:
         crop(ax, task)
         ax.set(xlabel="", ylabel="", xticks=[], yticks=[])

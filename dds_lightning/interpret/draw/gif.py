@@ -1,7 +1,7 @@
 """Animated GIFs that stay small.
 
-Matplotlib's own writer draws every frame from scratch and gives each its own colour table: 90 frames of a maze take 9 s
-and 200 kB there, 0.3 s and 50 kB here.
+Matplotlib's writer draws every frame from scratch and gives each its own colour table: 90 frames of a maze take 9 s and
+200 kB there, 0.3 s and 50 kB here.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 from PIL import Image
 
 LAST = 1500
-"""Milliseconds that the last frame stays, to see the end."""
+"""Duration of the last frame in milliseconds, to show the end."""
 
 
-class Still:
-    """A drawn figure in which a few things move: the rest is drawn once, which is what makes a clip fast.
+class CachedBackground:
+    """A figure in which a few artists move: the rest is drawn once and cached, which makes clips fast.
 
     Args:
-        figure: with everything in place.
-        moving: the artists that change from frame to frame.
+        figure: The figure with everything in place.
+        moving: The artists that change from frame to frame.
     """
 
     def __init__(self, figure: Figure, moving: Sequence[Any]) -> None:
@@ -39,7 +39,7 @@ class Still:
         self.background = self.canvas.copy_from_bbox(figure.bbox)
 
     def frame(self) -> NDArray[np.uint8]:
-        """The picture (h, w, 3) with the moving artists as they are now."""
+        """Return the picture (h, w, 3) with the moving artists in their current state."""
         self.canvas.restore_region(self.background)
         for artist in self.moving:
             self.figure.draw_artist(artist)
@@ -47,15 +47,15 @@ class Still:
 
 
 def gif_bytes(frames: Sequence[NDArray[np.uint8]], fps: int = 15, colours: int = 256) -> bytes:
-    """Encode pictures (h, w, 3) as a GIF that repeats for ever.
+    """Encode pictures (h, w, 3) as a GIF that repeats forever.
 
     Args:
-        frames: at least one.
-        fps: frames a second.
-        colours: of the one table that all frames share.
+        frames: The pictures, at least one.
+        fps: Frames per second.
+        colours: Size of the colour table, which all frames share.
     """
     images = [Image.fromarray(frame) for frame in frames]
-    # The last picture has nearly every colour of the others; of the rest the nearest is near enough.
+    # The last picture has nearly every colour of the others; for the rest the nearest one is close enough.
     table = images[-1].quantize(colours)
     small = [image.quantize(palette=table, dither=Image.Dither.NONE) for image in images]
     durations = [1000 // fps] * (len(small) - 1) + [LAST]

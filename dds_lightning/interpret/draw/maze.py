@@ -1,8 +1,8 @@
-"""Figures over a maze: where skills lead, how the policy stitches them, where it fails, what it believes.
+"""Figures over a maze: where skills lead, how the policy combines them, and where it fails.
 
-Every function takes a table of episodes and recorded paths, as `rollout(..., record=True)` gives and
-`RolloutResult.load` reads back, and returns a matplotlib figure. Sizes are for 7 inches of width and still readable
-when printed over one column of 3.5 inches.
+Every function takes a table of episodes and recorded paths, as returned by `rollout(..., record=True)` and
+`RolloutResult.load`, and returns a matplotlib figure. Figures are 7 inches wide and still readable when printed in a
+column of 3.5 inches.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,27 +37,27 @@ from dds_lightning.rollout.result import RolloutPath, RolloutResult
 from dds_lightning.tasks import Task
 
 REACH = 2.5
-"""Half a side of the window round a start, in cells."""
+"""Half the side of the window around a start, in cells."""
 
 
 def _rows_of(result: RolloutResult, actor: str) -> Any:
-    """The rows of one contestant.
+    """Return the rows of one contestant.
 
     Raises:
-        UserError: no such contestant.
+        UserError: The result has no such contestant.
     """
     table = result.episodes[result.episodes["actor"] == actor]
     if table.empty:
         known = ", ".join(result.episodes["actor"].unique())
-        raise UserError(f"there is no contestant '{actor}' in the table, only {known}")
+        raise UserError(f"actor is '{actor}', expected one of the contestants in the table: {known}")
     return table
 
 
 def _paths_of(result: RolloutResult, actor: str) -> list[tuple[Any, RolloutPath]]:
-    """Rows of the table with their paths.
+    """Return the rows of the table with their paths.
 
     Raises:
-        UserError: no such contestant, or nothing was recorded of it.
+        UserError: The result has no such contestant, or nothing was recorded for it.
     """
     rows = [
         (row, result.paths[actor, int(row.episode)])
@@ -70,7 +70,7 @@ def _paths_of(result: RolloutResult, actor: str) -> list[tuple[Any, RolloutPath]
 
 
 def _legend(ax: Axes, title: str, codes: NDArray[Any], label: Callable[[int, float], str], start: bool) -> None:
-    """Beside the maze: its marks, then the codes with how often they occur, the commonest first."""
+    """Draw the legend beside the maze: its marks, then the codes with their frequencies, the commonest first."""
     mark = partial(Line2D, [], [], linestyle="")
     handles = [mark(marker="*", markersize=11, color=START, markeredgecolor=START_EDGE, label="start")] if start else []
     handles.append(mark(marker="o", markersize=9, markerfacecolor="none", markeredgecolor=GOAL, label="goal"))
@@ -94,17 +94,17 @@ def _legend(ax: Axes, title: str, codes: NDArray[Any], label: Callable[[int, flo
 
 
 def plot_trajectories(task: Task, result: RolloutResult, actor: str, episodes: int = 12, numbered: int = 1) -> Figure:
-    """Episodes of one contestant over the maze, coloured by the skill in use (the paper's AntMaze figure, d and h).
+    """Draw episodes of one contestant over the maze, coloured by skill (the paper's AntMaze figure, d and h).
 
     Args:
-        task: the maze.
-        result: table and paths.
-        actor: the contestant.
-        episodes: how many paths to draw; successful ones first.
-        numbered: on how many of them the codes are written.
+        task: The maze.
+        result: Table and paths.
+        actor: The contestant.
+        episodes: How many paths to draw; successful ones first.
+        numbered: On how many of them the codes are written.
 
     Raises:
-        UserError: no such contestant, or no recorded paths of it.
+        UserError: The result has no such contestant, or no paths of it were recorded.
     """
     rows = sorted(_paths_of(result, actor), key=lambda row: not row[0].success)[:episodes]
     figure, ax = maze_figure(task)
@@ -121,16 +121,16 @@ def plot_trajectories(task: Task, result: RolloutResult, actor: str, episodes: i
 
 
 def plot_single_skills(task: Task, result: RolloutResult, actor: str = "single skill", steps: int = 150) -> Figure:
-    """Each skill alone in the task itself, one panel a skill.
+    """Draw each skill played alone in the task, one panel per skill.
 
     Args:
-        task: the maze.
-        result: table and paths; every episode of the contestant keeps to one skill.
-        actor: the contestant whose every part is one skill.
-        steps: how much of each replay to draw; later ones only pile up against a wall.
+        task: The maze.
+        result: Table and paths; every episode of the contestant keeps to one skill.
+        actor: The contestant whose parts are single skills.
+        steps: How many steps of each replay to draw; later ones only pile up against a wall.
 
     Raises:
-        UserError: no such contestant, or no recorded paths of it.
+        UserError: The result has no such contestant, or no paths of it were recorded.
     """
     groups: dict[int, list[tuple[Any, RolloutPath]]] = {}
     for row, path in _paths_of(result, actor):
@@ -154,14 +154,14 @@ def plot_starts_by_skill(
     codes: NDArray[Any],
     alive: NDArray[Any] | None = None,
 ) -> Figure:
-    """Each skill from several starts, one panel a skill (the paper's AntMaze figure, a to c).
+    """Draw each skill from several starts, one panel per skill (the paper's AntMaze figure, a to c).
 
     Args:
-        task: the maze.
-        starts: (N, 2) metres, where each replay was put.
+        task: The maze.
+        starts: (N, 2) start of each replay in metres.
         positions: (N, T + 1, 2) metres.
         codes: (N,) the skill of each replay.
-        alive: (N, T) False after a replay's end; all True without it.
+        alive: (N, T) False after a replay's end; None means all True.
     """
     shown = np.unique(codes)
     figure, axes = grid(len(shown), 1.75, panel_height(task, 1.75))
@@ -186,17 +186,17 @@ def plot_skills_by_start(
     alive: NDArray[Any] | None = None,
     reach: float | None = None,
 ) -> Figure:
-    """All skills from each of several starts, one panel a start, seen from near.
+    """Draw all skills from each of several starts, one close-up panel per start.
 
-    A skill's number is where its replay ends, or leaves the panel.
+    A skill's number marks where its replay ends or leaves the panel.
 
     Args:
-        task: the maze.
-        starts: (N, 2) metres, where each replay was put; equal rows share a panel.
+        task: The maze.
+        starts: (N, 2) start of each replay in metres; equal rows share a panel.
         positions: (N, T + 1, 2) metres.
         codes: (N,) the skill of each replay.
-        alive: (N, T) False after a replay's end; all True without it.
-        reach: half a side of the window in metres; without it two cells and a half.
+        alive: (N, T) False after a replay's end; None means all True.
+        reach: Half the side of the window in metres; None takes two and a half cells.
     """
     places, panel = np.unique(np.asarray(starts), axis=0, return_inverse=True)
     figure, axes = grid(len(places), 7.0 / 3, 2.4, columns=3)
@@ -216,31 +216,31 @@ def plot_skills_by_start(
         ax.label_outer()
         ax.tick_params(labelbottom=True, labelleft=True)
     steps = positions.shape[1] - 1
-    figure.suptitle(f"Every skill alone from the same start, {steps} steps; one panel a start", fontsize=LABEL)
+    figure.suptitle(f"Every skill alone from the same start, {steps} steps; one panel per start", fontsize=LABEL)
     return figure
 
 
 def _last_seen(ax: Axes, path: NDArray[Any]) -> NDArray[Any]:
-    """The last position of a path (T + 1, 2) before it leaves what a panel shows."""
+    """Return the last position of a path (T + 1, 2) before it leaves the panel."""
     (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
     out = np.flatnonzero(((path < (left, bottom)) | (path > (right, top))).any(axis=1))
     return np.asarray(path[max(out[0] - 1, 0) if len(out) else -1])
 
 
 def _lengths(positions: NDArray[Any], alive: NDArray[Any] | None) -> NDArray[np.int64]:
-    """Steps (N,) that each replay lasted."""
+    """Return the number of steps (N,) of each replay."""
     if alive is None:
         return np.full(len(positions), positions.shape[1] - 1)
     return np.asarray(alive).sum(axis=1)
 
 
 def plot_failures(task: Task, result: RolloutResult, actor: str) -> Figure:
-    """Where the failed episodes of a contestant ended, with the skill in use there; all ends when none failed.
+    """Draw where the failed episodes of a contestant ended, with the skill in use there; all ends if none failed.
 
-    A dot is one end, the bold number in a cell counts them.
+    A dot is one end; the bold number in a cell is their count.
 
     Raises:
-        UserError: no such contestant.
+        UserError: The result has no such contestant.
     """
     table = _rows_of(result, actor)
     failed = table[~table["success"].astype(bool)]
@@ -250,7 +250,7 @@ def plot_failures(task: Task, result: RolloutResult, actor: str) -> Figure:
     ends, codes = shown[["final_x", "final_y"]].to_numpy(), shown["final_code"].to_numpy()
     colours = [skill_colour(int(code)) for code in codes]
     ax.scatter(ends[:, 0], ends[:, 1], s=30, c=colours, edgecolors="white", linewidths=0.4, zorder=3)
-    written, room = np.empty((0, 2)), 0.3 * task.cell_size  # a number needs that much
+    written, room = np.empty((0, 2)), 0.3 * task.cell_size  # the space that a number needs
     for end, code in zip(ends, codes, strict=True):
         if code >= 0 and np.all(np.linalg.norm(end - written, axis=1) >= room):
             written = np.concatenate([written, end[None]])
@@ -271,7 +271,7 @@ def plot_failures(task: Task, result: RolloutResult, actor: str) -> Figure:
 
 
 def choose_episodes(result: RolloutResult, actor: str) -> Sequence[int]:
-    """Episodes of a contestant worth showing first: successful ones, the median length in front."""
+    """Return a contestant's episodes in the order to show them: successful ones first, beginning with median length."""
     table = result.episodes[result.episodes["actor"] == actor]
     good = table[table["success"].astype(bool)]
     pool = good if len(good) else table

@@ -1,11 +1,11 @@
 """Sixteen colours for skills.
 
-They were found by a search from hand-picked hues (blue, red, green, sky, pink, violet, gold, wine, then eight
-fillers): moved as little as possible until they stood apart in CIELAB as seen by normal eyes and by simulated
+They result from a search that started at hand-picked hues (blue, red, green, sky, pink, violet, gold, wine, then eight
+fillers) and moved them as little as possible until they were distinct in CIELAB as seen by normal eyes and by simulated
 deuteranopes and protanopes (Machado et al., 2009, severity 1), from each other, from white paper, from the walls and
 from the orange of the starts. The first eight differ by at least 23 in every view, all sixteen by at least 12 (a
-test holds both). No sixteen colours are safe for everybody, so every figure also writes the code's number where the
-skill is used: colour helps, the number decides.
+test checks both). No sixteen colours can be distinguished by everybody, so every figure also shows the code's number
+where the skill is used.
 """
 
 SKILL_COLOURS = (
@@ -34,12 +34,12 @@ NO_SKILL = "#5c6470"
 
 
 def skill_colour(code: int) -> str:
-    """Colour of a code; grey for -1, an actor without skills. From 16 codes on the colours come round again."""
+    """Return the colour of a code; grey for -1, an actor without skills. Beyond 16 codes the colours repeat."""
     return NO_SKILL if code < 0 else SKILL_COLOURS[code % len(SKILL_COLOURS)]
 
 
 def ink(colour: str) -> str:
-    """What is read on a colour: white if its contrast is at least 3 (WCAG 2's for large text), else black."""
+    """Return the text colour for a background: white if its contrast is at least 3 (WCAG 2, large text), else black."""
     channels = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
     linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in channels]
     luminance = sum(weight * c for weight, c in zip((0.2126, 0.7152, 0.0722), linear, strict=True))

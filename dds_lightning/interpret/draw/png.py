@@ -13,25 +13,25 @@ from scipy.spatial import cKDTree
 from dds_lightning.interpret.draw.palette import NO_SKILL, SKILL_COLOURS, START, WALL
 
 SMALL = 200_000
-"""Bytes that a small picture must stay below."""
+"""Maximum size of a small picture in bytes."""
 FIXED = np.array(
     [[round(255 * c) for c in to_rgb(name)] for name in (*SKILL_COLOURS, WALL, START, NO_SKILL, "white", "black")]
 )
-"""Colours (F, 3) that mean something."""
+"""Colours (F, 3) that carry meaning."""
 
 
 def png_bytes(figure: Figure, dpi: float = 130) -> bytes:
-    """A figure as a PNG picture; the same figure gives the same bytes."""
+    """Encode a figure as PNG; the same figure gives the same bytes."""
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=dpi, metadata={"Software": None})
     return file.getvalue()
 
 
 def small_png(data: bytes, limit: int = SMALL) -> bytes:
-    """A PNG picture with 256 colours, or with as many fewer as it takes to stay below `limit` bytes.
+    """Reduce a PNG picture to 256 colours, or to as many fewer as it takes to stay below `limit` bytes.
 
-    The colours of skills, walls and paper stay exactly what they are, and so do the commonest ones; a photograph gets
-    coarser. With 64 colours a picture may still be larger.
+    The colours of skills, walls and paper stay exactly as they are, and so do the commonest ones; a photograph becomes
+    coarser. A picture may still be larger with 64 colours, the minimum.
     """
     with Image.open(io.BytesIO(data)) as image:
         picture = image.convert("RGB")

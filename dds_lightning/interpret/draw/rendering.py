@@ -1,7 +1,7 @@
-"""Pictures by MuJoCo itself, where a graphics driver is there: the same frames as the stick figures.
+"""Pictures rendered by MuJoCo, if there is a graphics driver: the same frames as the stick figures.
 
-A driver that is missing or broken can end the process that asks for it, so pictures are made in a process of their own;
-where every backend fails, there are none, and the stick figures have to do.
+A missing or broken driver can end the process that uses it, so pictures are rendered in a separate process; if every
+backend fails, there are none, and the stick figures have to suffice.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from dds_lightning.tasks import Task, facts_to_keep
 BACKENDS = ("egl", "osmesa", "glfw")
 """Tried in this order unless `MUJOCO_GL` names one."""
 COLUMNS = 6
-"""Moments that are shown."""
+"""Maximum number of moments shown."""
 PATIENCE = 120.0
-"""Seconds that one backend may take."""
+"""Time limit of one backend in seconds."""
 _CODE = "from dds_lightning.interpret.draw.rendering import worker; worker()"
 
 
@@ -34,13 +34,13 @@ def render_frames(task: Task, qpos: NDArray[Any], width: int = 320, height: int 
     """Render a body at some moments, the camera beside its torso.
 
     Args:
-        task: the environment.
+        task: The environment.
         qpos: (T, nq); rows after the end of a replay (NaN) are left out.
-        width: pixels.
-        height: pixels.
+        width: Width in pixels.
+        height: Height in pixels.
 
     Returns:
-        (T, height, width, 3), or None where no graphics driver works.
+        (T, height, width, 3), or None if no graphics driver works.
     """
     qpos = np.asarray(qpos, dtype=np.float64)
     qpos = qpos[np.isfinite(qpos).all(axis=1)]
@@ -70,18 +70,18 @@ def render_frames(task: Task, qpos: NDArray[Any], width: int = 320, height: int 
 
 
 def plot_rendered(task: Task, frames: dict[int, NDArray[np.uint8]], every: int) -> Figure:
-    """Rendered frames side by side, a row a skill, a column a moment: some of those of `strobe.plot_strobes`.
+    """Draw rendered frames side by side, one row per skill, one column per moment, chosen from `strobe.plot_strobes`.
 
     Args:
-        task: the environment.
-        frames: code to (T, h, w, 3).
-        every: steps between two frames of the rendered series.
+        task: The environment.
+        frames: Code -> (T, h, w, 3).
+        every: Steps between two frames of the rendered series.
 
     Raises:
-        UserError: there is nothing to draw.
+        UserError: There is nothing to draw.
     """
     if not frames:
-        raise UserError("frames is empty: there is nothing to draw")
+        raise UserError("frames is empty, expected the frames of at least one skill")
     longest = max(map(len, frames.values()))
     moments = np.linspace(0, longest - 1, min(longest, COLUMNS)).round().astype(int)
     wide = 7.0 / len(moments)
@@ -90,7 +90,7 @@ def plot_rendered(task: Task, frames: dict[int, NDArray[np.uint8]], every: int) 
         for column, t in enumerate(moments):
             ax = axes[row * len(moments) + column]
             ax.set_axis_off()
-            if t >= len(series):  # it has fallen before
+            if t >= len(series):  # it has fallen earlier
                 continue
             ax.imshow(series[t])
             if column == 0:
@@ -102,7 +102,7 @@ def plot_rendered(task: Task, frames: dict[int, NDArray[np.uint8]], every: int) 
 
 
 def worker() -> None:
-    """What the process of its own runs: the request on standard input, an array on standard output."""
+    """Run the separate process: reads the request from standard input, writes an array to standard output."""
     sink = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # whatever a library prints must not land in the array
     with np.load(io.BytesIO(sys.stdin.buffer.read()), allow_pickle=False) as request:
@@ -111,7 +111,7 @@ def worker() -> None:
     np.save(file, _render(name, qpos, int(width), int(height)), allow_pickle=False)
     sink.write(file.getvalue())
     sink.flush()
-    os._exit(0)  # a driver that fails while it is put away has done its work
+    os._exit(0)  # a driver may fail during its clean-up, when its work is done
 
 
 def _render(facts: str, qpos: NDArray[np.float64], width: int, height: int) -> NDArray[np.uint8]:
@@ -121,9 +121,9 @@ def _render(facts: str, qpos: NDArray[np.float64], width: int, height: int) -> N
     from dds_lightning.interpret.views import view_of
     from dds_lightning.tasks import restore_task
 
-    mujoco.GLContext(16, 16).free()  # without a driver it ends here, before anything slow
+    mujoco.GLContext(16, 16).free()  # without a driver the process ends here, before anything slow
     task = restore_task(json.loads(facts), "the request")
-    assert task is not None, "the caller names it"
+    assert task is not None, "the caller passes a task"
     with simulator(task) as env:
         model: Any = env.unwrapped.model
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height

@@ -1,4 +1,4 @@
-"""How a policy strings skills together: the way of a few episodes, and the timeline of the codes below it."""
+"""How a policy combines skills: the paths of a few episodes, and below them the timeline of the codes."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from dds_lightning.tasks import Task
 from dds_lightning.tasks.bodies import body_of
 
 WIDTH = 7.0
-"""Inches of a figure."""
+"""Width of a figure in inches."""
 MAZES = 2
-"""Episodes whose way is drawn."""
+"""Number of episodes whose path is drawn."""
 SPAN = 400
-"""Steps that are shown where there is no maze: a runner does the same again and again."""
+"""Number of steps shown without a maze: a runner repeats its movements."""
 ROOM = 6.1
-"""Inches of a timeline."""
+"""Width of a timeline in inches."""
 SIZES = 4.5, 7.0
-"""Points of the numbers in a timeline: where not even the smallest fits into its piece, there is none."""
+"""Font sizes of the numbers in a timeline; a number is left out if not even the smallest fits."""
 
 
 def runs_of(codes: NDArray[Any]) -> list[tuple[int, int, int]]:
-    """Pieces of a sequence with one code each: (first step, number of steps, code)."""
+    """Split a sequence into segments of one code each: (first step, number of steps, code)."""
     codes = np.asarray(codes)
     cuts = np.flatnonzero(np.diff(codes)) + 1
     starts = np.concatenate([[0], cuts]).astype(int)
@@ -39,10 +39,10 @@ def runs_of(codes: NDArray[Any]) -> list[tuple[int, int, int]]:
 
 
 def best_episodes(result: RolloutResult, actor: str, count: int) -> list[int]:
-    """Recorded episodes of a contestant worth showing: successful ones, short before long; elsewhere by score.
+    """Return the recorded episodes to show: successful ones, shortest first; otherwise by score.
 
     Raises:
-        UserError: no paths of that contestant were recorded.
+        UserError: No paths of that contestant were recorded.
     """
     table = result.episodes[result.episodes["actor"] == actor]
     recorded = [int(number) for number in table["episode"] if (actor, int(number)) in result.paths]
@@ -58,20 +58,20 @@ def best_episodes(result: RolloutResult, actor: str, count: int) -> list[int]:
 
 
 def plot_stitching(task: Task, result: RolloutResult, actor: str, episodes: int = 6) -> Figure:
-    """Successful episodes with the skill in use, along the way and as a timeline (the paper's figure 4, d and h).
+    """Draw successful episodes with the skill in use, as paths and as a timeline (the paper's figure 4, d and h).
 
-    In a maze the first two are drawn over it, the number of a skill where it takes over; of a runner the height of the
-    first, if its observations were recorded. Everywhere each episode is a row of the timeline, in a maze as a whole,
-    elsewhere its first 400 steps. Where none succeeded, or nothing can succeed, the best by score are shown.
+    In a maze the first two are drawn over it, with a skill's number where it takes over; for a runner the height of the
+    first, if its observations were recorded. Each episode is a row of the timeline: all of it in a maze, otherwise its
+    first 400 steps. If none succeeded, or the task does not measure success, the best by score are shown.
 
     Args:
-        task: what was played.
-        result: table and paths, see `rollout` with ``record=True`` or ``record_observations=True``.
-        actor: the contestant.
-        episodes: rows of the timeline.
+        task: The task that was played.
+        result: Table and paths, see `rollout` with ``record=True`` or ``record_observations=True``.
+        actor: The contestant.
+        episodes: Number of rows in the timeline.
 
     Raises:
-        UserError: no paths of that contestant were recorded.
+        UserError: No paths of that contestant were recorded.
     """
     chosen = best_episodes(result, actor, episodes)
     table = result.episodes[result.episodes["actor"] == actor].set_index("episode")
@@ -80,7 +80,7 @@ def plot_stitching(task: Task, result: RolloutResult, actor: str, episodes: int 
     course = body_of(task).moves == "course" and result.paths[actor, chosen[0]].observations is not None
     tall = panel_height(task, WIDTH / MAZES - 0.55) + 0.55 if mazes else 1.7 if course else 0.0
     figure = Figure(figsize=(WIDTH, rows + tall + 0.35), layout="constrained")
-    words = "the skill in use"
+    title = "the skill in use"
     if mazes:
         upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=[tall, rows]).ravel()
         for number, ax in zip(chosen, np.ravel(upper.subplots(1, MAZES, squeeze=False)), strict=False):
@@ -99,26 +99,26 @@ def plot_stitching(task: Task, result: RolloutResult, actor: str, episodes: int 
     sequences = [result.paths[actor, number].codes for number in chosen]
     if not mazes and max(map(len, sequences)) > SPAN:
         sequences = [codes[:SPAN] for codes in sequences]
-        words += f" in the first {SPAN} steps"
+        title += f" in the first {SPAN} steps"
     draw_timeline(timeline, sequences, _names(task, table, chosen))
-    figure.suptitle(f"{actor}: {words}", fontsize=LABEL)
+    figure.suptitle(f"{actor}: {title}", fontsize=LABEL)
     return figure
 
 
 def draw_timeline(ax: Axes, sequences: Sequence[NDArray[Any]], names: Sequence[str]) -> None:
-    """Codes over time, a row each, with the number of a skill where there is room.
+    """Draw codes over time, one row per episode, with the number of a skill if there is room.
 
     Args:
-        ax: where.
+        ax: Axes to draw on.
         sequences: (T,) codes in use of each row.
-        names: of the rows.
+        names: Names of the rows.
     """
     longest = max(len(codes) for codes in sequences)
     for place, codes in enumerate(sequences):
         for start, length, code in runs_of(codes):
             colour = skill_colour(code)
             ax.barh(place, length, left=start, height=0.78, color=colour, edgecolor="white", linewidth=0.4)
-            size = min(55 * ROOM * length / longest, SIZES[1])  # two digits of this size are as wide as the piece
+            size = min(55 * ROOM * length / longest, SIZES[1])  # two digits of this size are as wide as the segment
             if size >= SIZES[0] and code >= 0:
                 middle = start + length / 2
                 ax.text(middle, place, str(code), color=ink(colour), fontsize=size, ha="center", va="center")
@@ -142,7 +142,7 @@ def _draw_way(ax: Axes, task: Task, result: RolloutResult, actor: str, number: i
 
 
 def _draw_height(ax: Axes, path: RolloutPath) -> None:
-    """The height of a runner's torso, coloured by the skill in use."""
+    """Draw the height of a runner's torso, coloured by the skill in use."""
     assert path.observations is not None
     height = np.asarray(path.observations)[: SPAN + 1, 0]
     for start, length, code in runs_of(path.codes[:SPAN]):
@@ -156,5 +156,5 @@ def _draw_height(ax: Axes, path: RolloutPath) -> None:
 def _names(task: Task, table: Any, chosen: list[int]) -> list[str]:
     if not task.measures_success:
         return [f"episode {number}\nscore {table.loc[number, 'score']:.0f}" for number in chosen]
-    words = {True: "succeeds", False: "fails"}
-    return [f"episode {number}\n{words[bool(table.loc[number, 'success'])]}" for number in chosen]
+    outcome = {True: "succeeds", False: "fails"}
+    return [f"episode {number}\n{outcome[bool(table.loc[number, 'success'])]}" for number in chosen]

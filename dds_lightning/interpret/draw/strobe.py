@@ -1,4 +1,4 @@
-"""Stroboscopic pictures and clips of moving bodies: stick figures of the model's own limbs (the paper's figure 3)."""
+"""Stroboscopic pictures and clips of moving bodies: stick figures of the model's limbs (the paper's figure 3)."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from numpy.typing import NDArray
 
 from dds_lightning.errors import UserError
 from dds_lightning.interpret.draw.drawing import LABEL, TICKS, draw_walls, grid, heading
-from dds_lightning.interpret.draw.gif import Still, gif_bytes
+from dds_lightning.interpret.draw.gif import CachedBackground, gif_bytes
 from dds_lightning.interpret.draw.palette import NO_SKILL, WALL, skill_colour
 from dds_lightning.interpret.measure.body import BodyFrames
 from dds_lightning.interpret.views import View, view_of
 from dds_lightning.tasks import Task
 
 WIDTH = 7.0
-"""Inches of a figure."""
+"""Width of a figure in inches."""
 FAINTEST = 0.16
-"""How solid the first body of a series is; the last one is 1."""
+"""Opacity of the first body of a series; that of the last one is 1."""
 MARGIN = 0.25
-"""Metres round what is drawn."""
+"""Margin around the drawing in metres."""
 WIDE = 3.5
-"""Panels wider than this times their height stand one below the other."""
+"""Panels wider than this times their height are placed one below the other."""
 ROUND = np.linspace(-np.pi / 2, np.pi / 2, 7)
-"""Angles at which the round end of a limb has its corners."""
+"""Angles of the polygon corners at the round end of a limb."""
 
 Floats = NDArray[np.float64]
 
@@ -39,23 +39,23 @@ Floats = NDArray[np.float64]
 def plot_strobes(
     task: Task, frames: Mapping[int, BodyFrames], every: int, step_seconds: float | None = None, title: str = ""
 ) -> Figure:
-    """A body under several skills: where it is every so many steps, the way of each joint between, the last one solid.
+    """Draw a body under several skills: its pose at regular intervals, the last one solid, and the paths of its joints.
 
-    All panels have one scale. A runner is seen from the side, an ant from above between the walls, the kitchen's arm
-    from behind with what it can move.
+    All panels have the same scale. A runner is seen from the side, an ant from above between the walls, the kitchen's
+    arm from behind with the objects that it can move.
 
     Args:
-        task: the environment.
-        frames: code to T + 1 frames, all from the same state; one panel each, in this order.
-        every: steps between two drawn bodies.
-        step_seconds: seconds of a step; without it the task's.
-        title: above the panels; without it what is drawn.
+        task: The environment.
+        frames: Code -> T + 1 frames, all from the same state; one panel each, in this order.
+        every: Steps between two drawn bodies.
+        step_seconds: Seconds per step; None takes the task's.
+        title: Title above the panels; None describes what is drawn.
 
     Raises:
-        UserError: there is nothing to draw.
+        UserError: There is nothing to draw.
     """
     if not frames or every < 1:
-        raise UserError(f"frames are of {len(frames)} skills, every is {every}: expected at least one skill and step")
+        raise UserError(f"frames has {len(frames)} skills and every is {every}, expected at least 1 of each")
     view = view_of(task)
     seconds = task.step_seconds if step_seconds is None else step_seconds
     low, high = _window(view, list(frames.values()))
@@ -66,7 +66,7 @@ def plot_strobes(
     for ax, (code, body) in zip(axes, frames.items(), strict=True):
         _scene(ax, task, view, body)
         last = len(body) - 1
-        for t in range(last % every, last + 1, every):  # the last one is always there
+        for t in range(last % every, last + 1, every):  # the last one is always shown
             colour = to_rgba(skill_colour(code), FAINTEST + (1 - FAINTEST) * (t / max(last, 1)) ** 1.5)
             _draw_body(ax, view, body, t, colour)
         faint = 0.35 if view.axes == (0, 1) else 0.8  # an ant has many joints
@@ -93,23 +93,23 @@ def plot_strobes(
 def body_clip(
     task: Task, body: BodyFrames, code: int, frames: int = 36, fps: int = 12, size: float = 2.9, seconds: float = 0.0
 ) -> bytes:
-    """A moving stick figure as an animated GIF.
+    """Encode a moving stick figure as an animated GIF.
 
     Args:
-        task: the environment.
+        task: The environment.
         body: T + 1 frames.
-        code: of the skill; gives the colour.
-        frames: at most this many pictures.
-        fps: pictures a second.
-        size: width in inches at 80 dots an inch.
-        seconds: of a step; 0 takes the task's.
+        code: The skill's code, which determines the colour.
+        frames: Maximum number of frames.
+        fps: Frames per second.
+        size: Width in inches at 80 dots per inch.
+        seconds: Seconds per step; 0 takes the task's.
     """
     view, seconds = view_of(task), seconds or task.step_seconds
     shown = np.unique(np.linspace(0, len(body) - 1, min(frames, len(body))).round().astype(int))
     follows = view.ground
     low, high = _window(view, [_centred(body) if follows else body])
     tall = float(np.clip(size * (high[1] - low[1]) / (high[0] - low[0]), 1.2, 0.8 * size)) + 0.3
-    if follows:  # the ground goes on to both sides
+    if follows:  # the ground extends on both sides
         half = max((high[1] - low[1]) * size / (tall - 0.3), high[0] - low[0]) / 2
         low[0], high[0] = np.array([-half, half]) + (low[0] + high[0]) / 2
     figure = Figure(figsize=(size, tall), dpi=80)
@@ -124,19 +124,19 @@ def body_clip(
     (joints,) = ax.plot([], [], ".", color="black", markersize=3, zorder=4)
     (things,) = ax.plot([], [], "s", color=NO_SKILL, markersize=4, zorder=2)
     caption = figure.text(0.03, 1 - 0.08 / tall, "", fontsize=8.5, va="top")
-    still = Still(figure, (marks, limbs, joints, things, caption))
+    background = CachedBackground(figure, (marks, limbs, joints, things, caption))
     pictures = []
     for t in shown:
         offset = np.array([body.root[t, view.axes[0]], 0.0]) if follows else np.zeros(2)
         limbs.set_verts(list(_capsules(body, t, view) - offset))
         joints.set_data(*(body.joints[t][:, view.axes] - offset).T)
         things.set_data(*body.objects[t][:, view.axes].T)
-        if follows:  # a mark on the ground every half metre tells the speed
+        if follows:  # a mark on the ground every half metre shows the speed
             left, right = ax.get_xlim()
             places = np.arange(np.ceil((left + offset[0]) * 2) / 2, right + offset[0], 0.5) - offset[0]
             marks.set_segments([[(x, 0.0), (x, -0.07)] for x in places])
         caption.set_text(f"skill {code}   {t * seconds:4.2f} s   {_travel(view, body, t)}")
-        pictures.append(still.frame())
+        pictures.append(background.frame())
     return gif_bytes(pictures, fps, colours=64)
 
 
@@ -144,7 +144,7 @@ def body_clip(
 
 
 def _scene(ax: Axes, task: Task, view: View, body: BodyFrames) -> None:
-    """What does not move: walls, or the ground."""
+    """Draw what does not move: walls, or the ground."""
     if task.maze_map is not None:
         draw_walls(ax, task)
     elif view.ground:
@@ -166,7 +166,7 @@ def _draw_body(ax: Axes, view: View, body: BodyFrames, t: int, colour: Any) -> N
 
 
 def _draw_objects(ax: Axes, view: View, body: BodyFrames, colour: str) -> None:
-    """The way of what the arm moved."""
+    """Draw the paths of the objects that the arm moved."""
     for path in np.moveaxis(body.objects[:, :, view.axes], 1, 0):
         if np.linalg.norm(path[-1] - path[0]) > 0.01:
             ax.plot(*path.T, color=colour, linewidth=2.0, zorder=2)
@@ -174,7 +174,7 @@ def _draw_objects(ax: Axes, view: View, body: BodyFrames, colour: str) -> None:
 
 
 def _capsules(body: BodyFrames, t: int, view: View) -> Floats:
-    """Outlines (L, P, 2) of the limbs as they are seen."""
+    """Return the outlines (L, P, 2) of the limbs in the view."""
     ends = body.limbs[t][:, :, view.axes]  # (L, 2, 2)
     along = ends[:, 1] - ends[:, 0]
     angle = np.arctan2(along[:, 1], along[:, 0])[:, None]  # (L, 1)
@@ -184,7 +184,7 @@ def _capsules(body: BodyFrames, t: int, view: View) -> Floats:
 
 
 def _centred(body: BodyFrames) -> BodyFrames:
-    """The body with its root at x = 0 all the time."""
+    """Return the body with its root at x = 0 in every frame."""
     shift = np.zeros_like(body.root)
     shift[:, 0] = body.root[:, 0]
     limbs, joints = body.limbs - shift[:, None, None], body.joints - shift[:, None]
@@ -192,7 +192,7 @@ def _centred(body: BodyFrames) -> BodyFrames:
 
 
 def _window(view: View, bodies: list[BodyFrames]) -> tuple[Floats, Floats]:
-    """Lower left and upper right corner (2,) of what some bodies need, with the ground and the objects."""
+    """Return lower left and upper right corner (2,) of the area that bodies, ground and objects need."""
     points = [body.limbs[..., view.axes].reshape(-1, 2) for body in bodies]
     points += [body.objects[..., view.axes].reshape(-1, 2) for body in bodies]
     everything = np.concatenate(points)
@@ -203,13 +203,13 @@ def _window(view: View, bodies: list[BodyFrames]) -> tuple[Floats, Floats]:
 
 
 def _travel(view: View, body: BodyFrames, t: int) -> str:
-    """How far the root has come by frame t."""
+    """Describe how far the root has moved by frame t."""
     away = (body.root[t] - body.root[0])[list(view.axes)]
     return f"{away[0]:+.2f} m" if view.ground else f"{np.linalg.norm(away):.2f} m"
 
 
 def _moved(task: Task, body: BodyFrames, seconds: float, falls: bool) -> str:
-    """A panel's words: how long, how far, how fast, or that it falls."""
+    """Describe a panel: how long, how far, how fast, or that the body falls."""
     view, last = view_of(task), len(body) - 1
     away = (body.root[-1] - body.root[0])[list(view.axes)]
     far = away[0] if view.ground else np.linalg.norm(away)

@@ -1,4 +1,4 @@
-"""What a critic believes and a policy does all over a maze: V as a heat map, the likeliest code and where it leads."""
+"""The critic and the policy over a whole maze: V as a heat map, the likeliest code and where it leads."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ if TYPE_CHECKING:
     from dds_lightning.policy import PolicyModule
 
 ValueFunction = Callable[[NDArray[np.float32]], NDArray[np.float32]]
-"""Observations (N, O) to values (N,)."""
+"""Maps observations (N, O) to values (N,)."""
 CodeFunction = Callable[[NDArray[np.float32]], NDArray[np.int64]]
-"""Observations (N, O) to codes (N,)."""
+"""Maps observations (N, O) to codes (N,)."""
 
 BANDS = 12
 """Colours of the value map."""
 STAYS = 0.02
-"""An arrow shorter than this share of a cell is not drawn: the skill leads nowhere from there."""
+"""An arrow shorter than this fraction of a cell is not drawn: the skill leads nowhere from there."""
 
 
 def value_and_codes(policy: PolicyModule) -> tuple[ValueFunction, CodeFunction]:
-    """V and the likeliest code of a policy as functions of NumPy observations (N, O)."""
+    """Return V and the likeliest code of a policy as functions of NumPy observations (N, O)."""
     policy.eval()
     device = next(policy.parameters()).device
 
@@ -51,24 +51,24 @@ def value_and_codes(policy: PolicyModule) -> tuple[ValueFunction, CodeFunction]:
 
 
 def value_table(task: Task, agent: DDSAgent, steps: int | None = None, seed: int = 0, env: Any = None) -> pd.DataFrame:
-    """The critic and the policy in every free cell, for a body at rest in its middle.
+    """Evaluate the critic and the policy in every free cell, for a body at rest in its middle.
 
     Args:
-        task: a maze.
-        agent: with a policy.
-        steps: that the likeliest code is held, to see where it leads; None takes H.
-        seed: of the decoder's noise.
-        env: from `replay.simulator`, if there is one already.
+        task: A maze.
+        agent: An agent with a policy.
+        steps: How many steps the likeliest code is held to see where it leads; None takes H.
+        seed: Seed of the decoder's noise.
+        env: An environment from `replay.simulator`; without it one is created.
 
     Returns:
-        A row a free cell: `row`, `column`, `x`, `y` (m), `value`, `code` (the likeliest), `probability` of it, `dx` and
-        `dy` (m, where it led).
+        One row per free cell: `row`, `column`, `x`, `y` (m), `value`, `code` (the likeliest), its `probability`, `dx`
+        and `dy` (m, where it led).
 
     Raises:
-        UserError: no maze, or no policy.
+        UserError: The task has no maze, or the agent has no policy.
     """
     if agent.policy is None:
-        raise UserError("the agent has no policy: there are no values and no choices to map")
+        raise UserError("the agent has no policy, expected one with values and choices to map")
     cells = task.free_cells()
     places = task.cell_to_xy(list(cells))
     observations = at_rest(task, places)
@@ -87,7 +87,7 @@ def value_table(task: Task, agent: DDSAgent, steps: int | None = None, seed: int
 
 
 def plot_policy_map(task: Task, agent: DDSAgent, steps: int | None = None, seed: int = 0, env: Any = None) -> Figure:
-    """`plot_value_map` of an agent, with arrows that show where the likeliest code leads from each very cell.
+    """Draw the `plot_value_map` of an agent, with arrows that show where the likeliest code leads from each cell.
 
     The arguments and errors are those of `value_table`.
     """
@@ -105,17 +105,17 @@ def plot_value_map(
     resolution: int = 6,
     arrows: NDArray[Any] | None = None,
 ) -> Figure:
-    """V over the free cells, the body at rest, with the chosen code and where it leads.
+    """Draw V over the free cells, the body at rest, with the chosen code and where it leads.
 
-    Each colour covers the same area of the maze, so that the slope is seen far from the goal too, where a
-    discounted value is small; the colour bar has the values at which they change.
+    Each colour covers the same area of the maze, so that the slope is visible far from the goal too, where a discounted
+    value is small; the colour bar shows the values at which colours change.
 
     Args:
-        task: the maze.
-        value: observations (N, O) to V (N,); position first, then the body as it starts an episode.
-        codes: observations (N, O) to codes (N,), asked at cell centres.
+        task: The maze.
+        value: Maps observations (N, O) to V (N,); position first, then the body as it starts an episode.
+        codes: Maps observations (N, O) to codes (N,); evaluated at cell centres.
         directions: (K, 2) mean displacement of each code in metres, for the arrows.
-        resolution: points a cell on each axis.
+        resolution: Points per cell on each axis.
         arrows: (C, 2) displacement of the chosen code from each free cell, in their order, instead of `directions`.
     """
     figure, ax = maze_figure(task)
@@ -128,7 +128,7 @@ def plot_value_map(
     points = np.concatenate([patch.reshape(-1, 2) for patch in patches])
     values = np.asarray(value(at_rest(task, points)), dtype=float).reshape(len(cells), resolution, resolution)
     edges = np.unique(np.quantile(values, np.linspace(0, 1, BANDS + 1)))
-    if len(edges) < 2:  # the same everywhere
+    if len(edges) < 2:  # V is the same everywhere
         edges = edges[0] + np.array([-0.5, 0.5])
     norm = BoundaryNorm(edges, 256)
     for centre, patch in zip(cells, values, strict=True):
@@ -143,7 +143,7 @@ def plot_value_map(
         for i, (centre, code) in enumerate(zip(cells, chosen, strict=True)):
             if ways is not None and (length := float(np.linalg.norm(ways[i]))) > STAYS * task.cell_size:
                 tip = centre + ways[i] / length * 0.48 * task.cell_size
-                outline = [withStroke(linewidth=3.2, foreground="black")]  # seen on dark and on light values
+                outline = [withStroke(linewidth=3.2, foreground="black")]  # visible on dark and on light values
                 line = {"color": "white", "lw": 1.5, "path_effects": outline}
                 arrow = {"arrowstyle": "->", "shrinkA": 0, "shrinkB": 0, **line}
                 ax.annotate("", tuple(tip), tuple(centre), arrowprops=arrow, zorder=5.5)

@@ -1,4 +1,4 @@
-"""Where a body's limbs and joints are, from the simulator's own model: what stick figures are drawn from.
+"""Where a body's limbs and joints are, from the simulator's model: the basis of stick figures.
 
 ```
  qpos (T, nq) ──► mj_kinematics ──► limbs (T, L, 2, 3): both ends of every limb's capsule
@@ -22,7 +22,7 @@ from dds_lightning.tasks import Task
 from dds_lightning.tasks.bodies import body_of
 
 ARM = 9
-"""Joints of the kitchen's robot; those after them move its objects."""
+"""Number of joints of the kitchen's robot; the joints after them move its objects."""
 
 THINGS = {
     "slidelink": "slide cabinet",
@@ -33,7 +33,7 @@ THINGS = {
     "lightswitchroot": "light switch",
     "lightblock_hinge": "",
 }
-"""Bodies of the kitchen's model to what they are called; knobs and burners have their own names."""
+"""Bodies of the kitchen's model -> their labels; knobs and burners keep their names."""
 
 Floats = NDArray[np.float64]
 
@@ -43,12 +43,12 @@ class BodyFrames:
     """A body at T moments.
 
     Attributes:
-        limbs: (T, L, 2, 3) metres, both ends of every limb; the same twice for a ball.
+        limbs: (T, L, 2, 3) metres, both ends of every limb, which coincide for a ball.
         widths: (L,) metres, their thickness.
         joints: (T, J, 3) metres, the joints between limbs.
         root: (T, 3) metres: the torso, in the kitchen the hand.
-        objects: (T, M, 3) metres: in the kitchen what can be moved, elsewhere nothing.
-        names: M names.
+        objects: (T, M, 3) metres: the movable objects in the kitchen; M = 0 elsewhere.
+        names: M names of the objects.
     """
 
     limbs: Floats
@@ -64,10 +64,10 @@ class BodyFrames:
 
 
 def body_frames(model: Any, qpos: NDArray[Any]) -> BodyFrames:
-    """Work out where limbs and joints are.
+    """Compute where limbs and joints are.
 
     Args:
-        model: the simulator's model, for example ``env.unwrapped.model``.
+        model: The simulator's model, for example ``env.unwrapped.model``.
         qpos: (T, nq) positions; rows after the end of a replay (NaN) are left out.
     """
     qpos = np.asarray(qpos, dtype=np.float64)
@@ -84,7 +84,7 @@ def body_frames(model: Any, qpos: NDArray[Any]) -> BodyFrames:
 
 
 class _Skeleton:
-    """Which parts of a model are limbs, joints and movable things."""
+    """The parts of a model that are limbs, joints and movable objects."""
 
     def __init__(self, model: Any) -> None:
         moving = model.body_weldid[model.geom_bodyid] != 0
@@ -108,15 +108,15 @@ class _Skeleton:
             self.widths[-2:] = 0.03
             things = [int(b) for b in dict.fromkeys(body[ARM:])]
             self.objects = [np.flatnonzero(model.body_weldid[model.geom_bodyid] == b) for b in things]
-            own = [model.body(b).name for b in things]
-            self.names = tuple(THINGS.get(name, name.lower()) for name in own)
+            bodies = [model.body(b).name for b in things]
+            self.names = tuple(THINGS.get(name, name.lower()) for name in bodies)
         self.hinges = hinges
 
     def at(self, data: Any) -> tuple[Floats, Floats, Floats, Floats]:
-        """Limbs (L, 2, 3), joints (J, 3), root (3,), objects (M, 3)."""
+        """Return limbs (L, 2, 3), joints (J, 3), root (3,), objects (M, 3)."""
         if len(self.arm):
             place = data.xpos[self.arm]  # (9, 3)
-            parents = np.minimum(np.arange(ARM - 1), 6)  # both fingers are of the hand
+            parents = np.minimum(np.arange(ARM - 1), 6)  # both fingers belong to the hand
             limbs = np.stack([place[parents], place[1:]], axis=1)
             root = place[7:].mean(axis=0)
         else:
@@ -129,15 +129,16 @@ class _Skeleton:
 
 
 def root_path(task: Task, model: Any, qpos: NDArray[Any]) -> Floats:
-    """Where a body is while it is replayed.
+    """Return where a body is during replays.
 
     Args:
-        task: the environment.
-        model: its model.
+        task: The environment.
+        model: The environment's model.
         qpos: (N, T + 1, nq); NaN after a replay's end.
 
     Returns:
-        (N, T + 1, D) metres: x and y in a maze, x and z of a runner, x, y and z of the kitchen's hand; NaN as `qpos`.
+        (N, T + 1, D) metres: x and y in a maze, x and z of a runner, x, y and z of the kitchen's hand; NaN wherever
+        `qpos` is.
     """
     if not view_of(task).hand:
         return np.asarray(qpos[..., :2], dtype=np.float64)
@@ -150,12 +151,12 @@ def root_path(task: Task, model: Any, qpos: NDArray[Any]) -> Floats:
 
 
 def to_body(task: Task, away: NDArray[Any], quaternions: NDArray[Any]) -> Floats:
-    """Displacements as the body itself sees them: an ant's ahead and to its left, any other body's as they are.
+    """Convert displacements to the body's frame: for an ant, ahead and to its left; unchanged for any other body.
 
     Args:
-        task: whose body.
-        away: (..., 2) along x and y; of bodies that do not turn any width.
-        quaternions: (..., 4) an ant's attitude, w first; anything of other bodies.
+        task: The task that defines the body.
+        away: (..., 2) along x and y; any width for bodies that do not turn.
+        quaternions: (..., 4) an ant's attitude, w first; ignored for other bodies.
     """
     away = np.asarray(away, dtype=np.float64)
     if body_of(task).heading is None:

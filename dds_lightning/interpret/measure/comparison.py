@@ -1,7 +1,7 @@
-"""Discrete against continuous skills: the same measurements, with continuous skills put into K clusters.
+"""Discrete against continuous skills: the same measurements, with continuous skills grouped into K clusters.
 
-The encodings of the data are put into K clusters by k-means; the nearest centre is a segment's code, and a cluster's
-centre is what is replayed. From there on both kinds are measured by the same functions.
+The encodings of the data are grouped into K clusters by k-means; a segment's code is the nearest centre, and the
+centres are what is replayed. From there on both kinds are measured by the same functions.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 
 class ClusteredSkills:
-    """Continuous skills as K codes: the nearest of K centres, in the space of encodings.
+    """Continuous skills as K codes: the nearest of K centres in the space of encodings.
 
     Args:
-        skill: with a Gaussian bottleneck.
+        skill: A skill model with a Gaussian bottleneck.
         centres: (K, D).
     """
 
@@ -40,7 +40,7 @@ class ClusteredSkills:
         self.horizon, self.num_skills = int(skill.horizon), len(centres)
 
     def encode(self, observations: Tensor, actions: Tensor, lengths: Tensor | None = None) -> Tensor:
-        """The nearest centre (B,) of each segment's mean encoding."""
+        """Return the nearest centre (B,) to each segment's mean encoding."""
         found = self.skill.encode_segments(observations, actions, lengths)
         return torch.cdist(found.vectors.float(), self.centres).argmin(dim=-1)
 
@@ -51,7 +51,7 @@ class ClusteredSkills:
         noise_scale: float | None = None,
         generator: torch.Generator | None = None,
     ) -> Tensor:
-        """Actions (B, A) under the centres of codes (B,)."""
+        """Return actions (B, A) under the centres of codes (B,)."""
         return self.skill.decode_vectors(observations, self.centres[codes], noise_scale, generator)
 
 
@@ -59,22 +59,22 @@ class ClusteredSkills:
 def cluster_skills(
     skill: SkillModule, trajectories: Trajectories, clusters: int, segments: int = 4000, seed: int = 0
 ) -> ClusteredSkills:
-    """Put a continuous model's skills into clusters, by k-means on the encodings of the data.
+    """Group a continuous model's skills into clusters, by k-means on the encodings of the data.
 
     Args:
-        skill: with a Gaussian bottleneck.
-        trajectories: the data.
+        skill: A skill model with a Gaussian bottleneck.
+        trajectories: The data.
         clusters: K.
-        segments: that are encoded, drawn from all.
-        seed: of the draw and of k-means.
+        segments: Number of segments that are encoded, drawn from all.
+        seed: Seed of the draw and of k-means.
 
     Raises:
-        UserError: the model's skills are discrete already, its widths are others, or the data have too few segments.
+        UserError: The model's skills are already discrete, its widths do not fit, or the data have too few segments.
     """
     from scipy.cluster.vq import kmeans2
 
     if skill.discrete:
-        raise UserError("bottleneck is vq: its skills are discrete already, only gaussian ones are put into clusters")
+        raise UserError("bottleneck is vq, expected gaussian: the skills are already discrete and need no clusters")
     check_widths(trajectories, skill)
     skill.eval()
     means = []
@@ -91,7 +91,7 @@ def cluster_skills(
 def _segments(
     trajectories: Trajectories, horizon: int, count: int, seed: int, device: torch.device
 ) -> Iterator[tuple[Tensor, Tensor]]:
-    """Drawn segments of the data in batches: observations (B, H, O) and actions (B, H, A)."""
+    """Yield drawn segments of the data in batches: observations (B, H, O) and actions (B, H, A)."""
     windows = trajectories.windows(horizon)
     chosen = np.sort(np.random.default_rng(seed).permutation(len(windows))[:count])
     span = np.arange(horizon)
@@ -105,17 +105,17 @@ def _segments(
 def decoding_error(
     skill: SkillModule | ClusteredSkills, trajectories: Trajectories, segments: int = 1000, seed: int = 0
 ) -> float:
-    """How far decoded actions are from those of the data, in the environment's units.
+    """Return how far decoded actions are from those of the data, in the environment's units.
 
-    Each segment is encoded, and an action drawn in each of its states, with the model's full noise, under what was
-    found: the code of discrete skills, the centre of a continuous one's cluster, or, for a continuous model itself, the
-    segment's own vector.
+    Each segment is encoded, and an action is drawn in each of its states with the model's full noise, given the
+    encoding: the code of discrete skills, the centre of a continuous skill's cluster, or, for a continuous model
+    itself, the vector of that segment.
 
     Args:
-        skill: any of the three.
-        trajectories: the data; best such that the model was not trained on.
-        segments: that are decoded, drawn from all.
-        seed: of the draw and of the noise.
+        skill: A model of any of the three kinds.
+        trajectories: The data; preferably data that the model was not trained on.
+        segments: Number of segments that are decoded, drawn from all.
+        seed: Seed of the draw and of the noise.
 
     Returns:
         The root mean square error of one entry of an action.
@@ -146,30 +146,30 @@ def compare_recovery(
     seed: int = 0,
     report: Callable[[str], None] | None = None,
 ) -> pd.DataFrame:
-    """The same measurement for several models, from the same states: discrete against continuous, seed by seed.
+    """Measure several models from the same states: discrete against continuous, seed by seed.
 
     Args:
-        task: the environment.
-        trajectories: the data that states are drawn from and continuous skills are put into clusters on.
-        models: name and model; models of one name are seeds of one kind.
+        task: The environment.
+        trajectories: The data from which states are drawn and continuous skills are clustered.
+        models: Name and model; models of one name are seeds of one kind.
         clusters: K for continuous models; None takes that of the first discrete one.
-        states: from which every code is replayed.
-        seed: of states, noise and k-means.
-        report: told the name of each model before its turn.
+        states: Number of states from which every code is replayed.
+        seed: Seed of states, noise and k-means.
+        report: Called with the name of each model before its turn.
 
     Returns:
-        A row a model: `model`, `seed` (counted within its name), `kind` ("discrete" or "continuous"), the facts of
-        `recovery.Recovery`, `own_accuracy` and `own_control`, those of `recovery.round_trip`, and `decoded`, the
-        `decoding_error` under codes, with `decoded_own`, that under each segment's own vector (NaN for discrete skills,
+        One row per model: `model`, `seed` (counted within its name), `kind` ("discrete" or "continuous"), the facts of
+        `recovery.Recovery`, `own_accuracy` and `own_control` from `recovery.round_trip`, `decoded`, the
+        `decoding_error` under codes, and `decoded_own`, that under each segment's vector (NaN for discrete skills,
         which have none).
 
     Raises:
-        UserError: continuous models alone, and no `clusters`.
+        UserError: All models are continuous and `clusters` is None.
     """
     every = list(models)
     known = clusters or next((model.num_skills for _, model in every if model.discrete), None)
     if known is None:
-        raise UserError("clusters is missing: among continuous models alone nothing says into how many to put them")
+        raise UserError("clusters is missing: with continuous models only, give the number of clusters")
     drawn = draw_states(task, trajectories, states, seed)
     rows: list[dict[str, Any]] = []
     with simulator(task) as env:
@@ -180,12 +180,12 @@ def compare_recovery(
             kind = "discrete" if model.discrete else "continuous"
             skills = model if model.discrete else cluster_skills(model, trajectories, known, seed=seed)
             found, _ = code_recovery(task, skills, drawn, seed=seed, env=env)
-            own = round_trip(task, skills, trajectories, states, seed=seed, env=env)
+            trip = round_trip(task, skills, trajectories, states, seed=seed, env=env)
             number = sum(row["model"] == name for row in rows)
-            trip = {"own_accuracy": own.accuracy, "own_control": own.control}
+            shares = {"own_accuracy": trip.accuracy, "own_control": trip.control}
             errors = {
                 "decoded": decoding_error(skills, trajectories, seed=seed),
                 "decoded_own": math.nan if model.discrete else decoding_error(model, trajectories, seed=seed),
             }
-            rows.append({"model": name, "seed": number, "kind": kind, **found.facts(), **trip, **errors})
+            rows.append({"model": name, "seed": number, "kind": kind, **found.facts(), **shares, **errors})
     return pd.DataFrame(rows)

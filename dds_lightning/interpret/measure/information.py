@@ -8,22 +8,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 BINS = 5
-"""Parts, with as many displacements each, into which every coordinate is cut."""
+"""Number of bins, with equally many displacements each, into which every coordinate is divided."""
 SHUFFLES = 20
-"""Permutations whose mean information is taken off: chance alone makes some in few samples."""
+"""Permutations whose mean information is subtracted: few samples show some by chance alone."""
 
 
 def mutual_information(codes: NDArray[Any], values: NDArray[Any], bins: int = BINS, seed: int = 0) -> float:
     """Mutual information in bits between a code and where it leads.
 
-    Every coordinate is cut into parts with as many values each; what shuffled codes have on average is taken off, and
-    less than nothing counts as 0.
+    Every coordinate is divided into bins with equally many values; the average for shuffled codes is subtracted, and a
+    negative result counts as 0.
 
     Args:
         codes: (N,).
         values: (N, D), for example displacements.
-        bins: parts a coordinate.
-        seed: of the shuffles.
+        bins: Bins per coordinate.
+        seed: Seed of the shuffles.
     """
     values = np.atleast_2d(np.asarray(values, dtype=np.float64).T).T
     known = np.isfinite(values).all(axis=1)
@@ -39,7 +39,7 @@ def mutual_information(codes: NDArray[Any], values: NDArray[Any], bins: int = BI
 
 
 def _information(first: NDArray[np.int64], second: NDArray[np.int64]) -> float:
-    """Plug-in mutual information in bits of two columns of small integers."""
+    """Return the plug-in mutual information in bits of two columns of small integers."""
     joint = np.zeros((int(first.max(initial=0)) + 1, int(second.max(initial=0)) + 1))
     np.add.at(joint, (first, second), 1.0 / max(len(first), 1))
     apart = joint.sum(axis=1, keepdims=True) * joint.sum(axis=0, keepdims=True)

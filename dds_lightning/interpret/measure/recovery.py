@@ -1,4 +1,4 @@
-"""Does a skill mean something? Whether a code can be told from the behaviour that it produces, and how much it decides.
+"""Does a skill mean something? Whether a code can be recognised from its behaviour, and how much it determines.
 
 ```
  round trip    segment of the data ─► encoder ─► k          hold k from the segment's first state, encode that: k again?
@@ -7,10 +7,10 @@
                                   └──► displacement ──► mutual information with k
 ```
 
-The round trip asks in states where the data use the code. There a state alone may give the code away (a runner's codes
-are often phases of its gait), which is what the control is for: what the code itself does, is accuracy less control.
-Recovery plays every code from the same states, so that a state says nothing, and asks more: a decoder need not follow a
-code in states where the data never use it. Chance is 1 / K in both, for codes are played equally often.
+The round trip uses states in which the data use the code. There the state alone may give the code away (a runner's
+codes are often phases of its gait). The control measures this: the effect of the code itself is accuracy minus control.
+Recovery plays every code from the same states, so a state gives nothing away. It is the harder test: a decoder need not
+follow a code in states where the data never use it. Chance is 1 / K in both, because codes are played equally often.
 """
 
 from __future__ import annotations
@@ -33,29 +33,29 @@ from dds_lightning.interpret.measure.states import BodyStates, states_at
 from dds_lightning.tasks import Task
 
 POOL = 4000
-"""Segments of the data among which those of a round trip are drawn."""
+"""Number of segments of the data from which those of a round trip are drawn."""
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Recovery:
-    """How well codes are told from behaviour.
+    """How well codes are recognised from behaviour.
 
     Attributes:
         codes: (C,) the codes that were replayed.
-        confusion: (C, C) share of the replays of code i (row) that the encoder takes for code j; what it takes for a
-            code that was not replayed is missing from the row's sum.
-        accuracy: share of all replays whose code is recovered.
-        error: standard error of `accuracy`, over states.
+        confusion: (C, C) share of the replays of code i (row) that the encoder takes for code j; a row sums to less
+            than 1 if some are taken for codes that were not replayed.
+        accuracy: Share of all replays whose code is recovered.
+        error: Standard error of `accuracy`, over states.
         chance: 1 / C.
-        information: mutual information in bits between code and displacement, over states and codes.
-        information_in_state: the same for `effects`. Where a body's speed decides where it goes in H steps, this is the
-            larger by far.
-        effects: (C, S, D) metres, what each code does to the displacement from each state: the mean over the codes from
-            the same state is taken off. An ant's is ahead of it and to its left, as it stands in that state.
-        most: bits that both can be at most, log2 C.
-        states: number of states that each code was replayed from.
+        information: Mutual information in bits between code and displacement, over states and codes.
+        information_in_state: The same for `effects`. This is far larger if the body's speed determines where it goes in
+            H steps.
+        effects: (C, S, D) metres, effect of each code on the displacement from each state: the displacement minus its
+            mean over the codes from that state. For an ant, ahead of it and to its left as it faces in that state.
+        most: Upper bound of both in bits, log2 C.
+        states: Number of states that each code was replayed from.
         steps: H.
     """
 
@@ -90,14 +90,14 @@ def code_recovery(
     """Replay codes for H steps, encode what happened, and compare.
 
     Args:
-        task: the environment.
-        skills: a discrete skill model, or `cluster_skills` of a continuous one.
-        states: S states, for example of `replay.draw_states`.
-        codes: (C,) those to replay, for example the codes in use; None takes all.
-        noise_scale: as in `replay.replay_codes`.
-        seed: of the decoder's noise.
-        env: from `replay.simulator`, if there is one already.
-        report: told the steps done so far.
+        task: The environment.
+        skills: A discrete skill model, or `cluster_skills` of a continuous one.
+        states: S states, for example from `states.draw_states`.
+        codes: (C,) codes to replay, for example those in use; None takes all.
+        noise_scale: Factor on the decoder's noise, see `replay.replay_codes`.
+        seed: Seed of the decoder's noise.
+        env: An environment from `replay.simulator`; without it one is created.
+        report: Called with the number of steps done so far.
 
     Returns:
         The result, and the C x S replays that it was measured on.
@@ -110,7 +110,7 @@ def code_recovery(
     found = encode_replays(skills, made)
     hits = (found == made.codes).reshape(len(chosen), len(states))
     confusion = np.stack([(found[made.codes == k][:, None] == chosen).mean(axis=0) for k in chosen])
-    by_state = hits.mean(axis=0)  # replays from one state are alike, so states are what was drawn
+    by_state = hits.mean(axis=0)  # replays from one state are similar: the independent sample is the state
     error = float(by_state.std(ddof=1) / math.sqrt(len(states))) if len(states) > 1 else math.nan
     by_code = moved.reshape(len(chosen), len(states), -1)
     effects = to_body(task, by_code - by_code.mean(axis=0), states.qpos[:, 3:7])  # (C, S, D)
@@ -131,18 +131,18 @@ def code_recovery(
 
 @dataclass(frozen=True, eq=False)
 class RoundTrip:
-    """How well codes are told from behaviour in states where the data use them.
+    """How well codes are recognised from behaviour in states where the data use them.
 
     Attributes:
-        codes: (C,) the codes that were replayed: those that enough segments of the data have.
+        codes: (C,) the codes that were replayed: those with enough segments in the data.
         confusion: (C, C) as in `Recovery`.
         by_code: (C,) share of each code's replays in which it is found again.
-        accuracy: mean of `by_code`.
-        error: its standard error, over segments.
-        control: share of the replays of another code, from the same states, that are taken for the code of the data:
-            how far the state alone gives it away.
+        accuracy: Mean of `by_code`.
+        error: Its standard error, over segments.
+        control: Share of the replays of another code, from the same states, that are taken for the code of the data:
+            how much the state alone gives it away.
         chance: 1 / C.
-        segments: of the data, for each code.
+        segments: Number of segments of the data for each code.
     """
 
     codes: NDArray[np.int64]
@@ -169,16 +169,16 @@ def round_trip(
     seed: int = 0,
     env: Any = None,
 ) -> RoundTrip:
-    """Encode segments of the data, hold the code found from each one's first state, and encode what happens then.
+    """Encode segments of the data, hold each one's code from its first state, and encode what happens then.
 
     Args:
-        task: the environment.
-        skills: as in `code_recovery`.
-        trajectories: the data.
-        segments: for each code; a code of fewer among those that are looked at is left out, the commonest never is.
-        noise_scale: as in `replay.replay_codes`.
-        seed: of the draws and of the decoder's noise.
-        env: from `replay.simulator`, if there is one already.
+        task: The environment.
+        skills: The skills, see `code_recovery`.
+        trajectories: The data.
+        segments: Number of segments per code; codes with fewer are left out, except for the commonest code.
+        noise_scale: Factor on the decoder's noise, see `replay.replay_codes`.
+        seed: Seed of the draws and of the decoder's noise.
+        env: An environment from `replay.simulator`; without it one is created.
     """
     rng = np.random.default_rng(seed)
     windows = trajectories.windows(skills.horizon)
@@ -209,7 +209,7 @@ def round_trip(
 
 
 def encode_replays(skills: Skills, replays: Replays) -> NDArray[np.int64]:
-    """Codes (N,) that the encoder finds in replays of H steps; one that ended sooner counts as so short."""
+    """Return codes (N,) of replays of H steps; a replay that ended early is encoded as a shorter segment."""
     lengths = np.maximum(replays.lengths, 1)
     steps = np.minimum(np.arange(skills.horizon), lengths[:, None] - 1)  # (N, H): repeats the last step, as relabelling
     rows = np.arange(len(steps))[:, None]
@@ -220,7 +220,7 @@ def encode_replays(skills: Skills, replays: Replays) -> NDArray[np.int64]:
 def encode(
     skills: Skills, observations: NDArray[Any], actions: NDArray[Any], lengths: NDArray[Any] | None = None
 ) -> NDArray[np.int64]:
-    """Codes (N,) of segments (N, H, O), (N, H, A), of which some may be shorter than H."""
+    """Return codes (N,) of segments (N, H, O), (N, H, A), some of which may be shorter than H."""
     device = _device(skills)
     codes = []
     for part in np.array_split(np.arange(len(observations)), max(len(observations) // 2048, 1)):
@@ -236,6 +236,6 @@ def _device(skills: Skills) -> torch.device:
 
 
 def displacements(paths: NDArray[Any], lengths: NDArray[Any]) -> Floats:
-    """How far (N, D) each path (N, T + 1, D) leads, to the end of its replay."""
+    """Return the displacements (N, D) of paths (N, T + 1, D) up to the end of each replay."""
     ends = paths[np.arange(len(paths)), np.asarray(lengths)]
     return np.asarray(ends - paths[:, 0], dtype=np.float64)

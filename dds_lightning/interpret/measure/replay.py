@@ -1,13 +1,13 @@
-"""Skills replayed from given states: the simulator is put there, and one code is held for H steps or several times H.
+"""Skills replayed from given states: the simulator is set to a state, and one code is held for H steps or a multiple.
 
 ```
- state 0 ─┬─ code 0 ─► s, a, s, a, ...        every code from every state: what differs, the code did
+ state 0 ─┬─ code 0 ─► s, a, s, a, ...        every code from every state: differences are due to the code
           └─ code 1 ─► s, a, s, a, ...
  state 1 ─┬─ code 0 ─► ...
 ```
 
-One environment plays all replays side by side: before each step it is put into the replay's own state, the solver's
-memory included. That is as exact as an environment each, and much quicker to build.
+One environment plays all replays side by side: before each step it is set to the replay's state, the solver's
+memory included. That is as exact as one environment per replay, and much quicker to build.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from dds_lightning.tasks import Task
 from dds_lightning.tasks.env import open_env
 
 Act = Callable[[NDArray[np.float32], NDArray[np.intp]], NDArray[np.float32]]
-"""Observations (n, O) of the replays numbered `rows` (n,) to actions (n, A)."""
+"""Maps observations (n, O) of the replays numbered `rows` (n,) to actions (n, A)."""
 
 _STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
 class Skills(Protocol):
-    """What is replayed and recovered: a discrete skill model, or a continuous one in clusters (`recovery`)."""
+    """The interface of what is replayed and recovered: a discrete skill model, or a clustered continuous one."""
 
     horizon: int
     num_skills: int
@@ -56,14 +56,14 @@ class Skills(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Replays:
-    """N replays of T steps; what comes after the end of an episode is NaN.
+    """N replays of T steps; values after the end of an episode are NaN.
 
     Attributes:
-        codes: (N,) code held.
-        states: (N,) number of the state that the replay began in.
+        codes: (N,) the code held.
+        states: (N,) number of the state that the replay started in.
         observations: (N, T + 1, O) float32.
         actions: (N, T, A) float32.
-        rewards: (N, T) the environment's own.
+        rewards: (N, T) the environment's rewards.
         qpos: (N, T + 1, nq).
         alive: (N, T) whether the step was taken.
     """
@@ -82,7 +82,7 @@ class Replays:
         return self.alive.sum(axis=1)
 
     def take(self, index: ArrayLike) -> Replays:
-        """The replays numbered `index` (or chosen by a mask), in that order."""
+        """Return the replays numbered `index` (or chosen by a mask), in that order."""
         rows = np.asarray(index)
         return Replays(**{name: values[rows] for name, values in vars(self).items()})
 
@@ -92,14 +92,14 @@ class Replays:
 
 @contextlib.contextmanager
 def simulator(task: Task) -> Iterator[Any]:
-    """The task's environment after a reset; `unwrapped` has its `model` and `data`.
+    """Yield the task's environment after a reset; `unwrapped` has its `model` and `data`.
 
     Raises:
-        UserError: It is not simulated by MuJoCo.
+        UserError: The environment is not simulated by MuJoCo.
     """
     with open_env(task) as env:
         if not hasattr(env.unwrapped, "model"):
-            raise UserError(f"task '{task.name}': {task.env_id} has no MuJoCo model, so no skill can be replayed in it")
+            raise UserError(f"task '{task.name}': {task.env_id} has no MuJoCo model, so skills cannot be replayed")
         yield env
 
 
@@ -118,22 +118,22 @@ def replay_codes(
     """Play every code from every state.
 
     Args:
-        task: the environment.
-        skills: whose decoder plays; a model's own device is used.
+        task: The environment.
+        skills: The model whose decoder plays; it stays on its device.
         states: S states.
-        codes: those to play; None plays all.
-        steps: T; None the skills' horizon H.
-        noise_scale: factor on the decoder's noise; None takes the model's own.
-        seed: of the decoder's noise.
-        env: from `simulator`, to play in an environment that is there already.
-        each: `codes` (S,) is one code a state, instead of all from all.
-        report: told the number of steps done so far, for a progress bar.
+        codes: Codes to play; None plays all of them.
+        steps: T; None takes the skills' horizon H.
+        noise_scale: Factor on the decoder's noise; None takes the model's.
+        seed: Seed of the decoder's noise.
+        env: An environment from `simulator`; without it one is created.
+        each: Whether `codes` (S,) holds one code per state, instead of all codes for all states.
+        report: Called with the number of steps done so far, for a progress bar.
 
     Returns:
         S x K replays, code by code: replay ``i * S + j`` is the i-th code from state j.
 
     Raises:
-        UserError: a code that there is not, or no state.
+        UserError: A code does not exist, or there are no states.
     """
     chosen = np.arange(skills.num_skills) if codes is None else np.asarray(codes, dtype=np.int64)
     if not len(states) or not len(chosen) or chosen.min() < 0 or chosen.max() >= skills.num_skills:
@@ -161,7 +161,7 @@ def replay_codes(
 def _play(
     env: Any, task: Task, act: Act, states: BodyStates, steps: int, report: Callable[[int], None] | None
 ) -> dict[str, NDArray[Any]]:
-    """Play N replays for T steps, or until their episode ends; everything of `Replays` but codes and states."""
+    """Play N replays for T steps, or until their episode ends; returns `Replays` without codes and states."""
     inner = env.unwrapped
     model, data = inner.model, inner.data
     robot = getattr(inner, "robot_env", None)
@@ -174,7 +174,7 @@ def _play(
     alive = np.zeros((count, steps), bool)
     observations[:, 0], qpos[:, 0] = states.observations, states.qpos
     for n in range(count):
-        mujoco.mj_resetData(model, data)  # no solver's memory of the state before
+        mujoco.mj_resetData(model, data)  # clears what the solver remembers of the previous state
         data.qpos[:], data.qvel[:] = states.qpos[n], states.qvel[n]
         mujoco.mj_forward(model, data)
         mujoco.mj_getState(model, data, memory[n], _STATE)
@@ -187,12 +187,12 @@ def _play(
         ended = np.zeros(len(going), bool)
         for i, n in enumerate(map(int, going)):
             mujoco.mj_setState(model, data, memory[n], _STATE)
-            if robot is not None:  # the kitchen's arm moves from where it last saw its joints
+            if robot is not None:  # the kitchen's arm moves from where it last observed its joints
                 robot._last_robot_qpos = observations[n, t, :9].astype(np.float64)
             observations[n, t + 1], rewards[n, t], terminated, *_ = env.step(actions[n, t])
             mujoco.mj_getState(model, data, memory[n], _STATE)
             qpos[n, t + 1] = data.qpos
-            # The kitchen ends when its subtasks are done, which it counts over all that was played in it.
+            # The kitchen ends when its subtasks are done, which it counts over all replays played in it.
             ended[i] = terminated and robot is None
         going = going[~ended]
         if report is not None:
@@ -201,13 +201,13 @@ def _play(
 
 
 def play_skills(task: Task, skills: Skills, steps: int = 2000, seed: int = 0) -> Played:
-    """Episodes of random skills: states to replay from where no observation holds the simulator's state.
+    """Play episodes of random skills, to get states to replay from if observations do not hold the simulator's state.
 
     Args:
         task: The environment.
-        skills: Whose decoder plays.
-        steps: At least so many in all.
-        seed: Of the codes and of the decoder's noise.
+        skills: The model whose decoder plays.
+        steps: Minimum number of steps in total.
+        seed: Seed of the codes and of the decoder's noise.
     """
     rng, stream = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
     episodes: list[dict[str, Any]] = []

@@ -33,21 +33,21 @@ class BodyStates:
         return len(self.qpos)
 
     def take(self, index: ArrayLike) -> BodyStates:
-        """The states numbered `index`, in that order."""
+        """Return the states numbered `index`, in that order."""
         rows = np.asarray(index)
         return BodyStates(self.observations[rows], self.qpos[rows], self.qvel[rows])
 
 
 def body_states(task: Task, observations: ArrayLike, previous: ArrayLike | None = None) -> BodyStates:
-    """The simulator's states behind some observations.
+    """Return the simulator's states behind some observations.
 
-    What an observation leaves out is filled in: a runner stands at x = 0, on which no force depends; a kitchen whose
-    observations hold no velocities moves as from the previous observation, or is at rest.
+    What an observation leaves out is filled in: a runner stands at x = 0, which no force depends on; a kitchen whose
+    observations hold no velocities gets those since the previous observation, or is at rest.
 
     Args:
-        task: whose observations.
+        task: The task that defines the observations.
         observations: (S, O).
-        previous: (S, O) a step earlier; NaN rows where there is none.
+        previous: (S, O) observations a step earlier; NaN rows where there is none.
     """
     seen = np.asarray(observations, dtype=np.float64)
     layout = state_layout(task, seen.shape[1])
@@ -57,7 +57,7 @@ def body_states(task: Task, observations: ArrayLike, previous: ArrayLike | None 
     if layout.velocities:
         qvel[:] = seen[:, list(layout.velocities)]
     elif previous is not None:
-        # Joints alone: of the kettle's seven position numbers four are a quaternion, and it mostly stands.
+        # Joints only: four of the kettle's seven position numbers are a quaternion, and it mostly stands.
         joints = np.nan_to_num((seen - np.asarray(previous, dtype=np.float64))[:, positions]) / task.step_seconds
         free = len(positions) - 7
         qvel[:, :free] = joints[:, :free]
@@ -68,10 +68,10 @@ def draw_states(task: Task, trajectories: Trajectories, count: int, seed: int = 
     """Draw states from all over a data set, none of them an episode's last.
 
     Args:
-        task: what the data are of.
-        trajectories: the data.
-        count: S; fewer come back from shorter data.
-        seed: of the draw.
+        task: The task of the data.
+        trajectories: The data.
+        count: S; fewer are returned from shorter data.
+        seed: Seed of the draw.
     """
     rng = np.random.default_rng(seed)
     steps = np.sort(rng.choice(trajectories.num_steps, min(count, trajectories.num_steps), replace=False))
@@ -79,7 +79,7 @@ def draw_states(task: Task, trajectories: Trajectories, count: int, seed: int = 
 
 
 def states_at(task: Task, trajectories: Trajectories, rows: NDArray[Any]) -> BodyStates:
-    """The simulator's states in some rows of observations of a data set, see `body_states`."""
+    """Return the simulator's states in some rows of a data set's observations, see `body_states`."""
     if isinstance(trajectories, Played):
         return BodyStates(trajectories.observations[rows], trajectories.qpos[rows], trajectories.qvel[rows])
     previous = trajectories.observations[np.maximum(rows - 1, 0)].astype(np.float64)
@@ -101,16 +101,16 @@ class Played(Trajectories):
 
 
 def rest_states(task: Task, cells: Sequence[Cell]) -> BodyStates:
-    """The body at rest in the middle of some cells of a maze, an ant upright.
+    """Return states of the body at rest in the middle of some cells of a maze, an ant upright.
 
     Raises:
-        UserError: the task has no maze.
+        UserError: The task has no maze.
     """
     return body_states(task, at_rest(task, task.cell_to_xy(list(cells))))
 
 
 def at_rest(task: Task, points: ArrayLike) -> NDArray[np.float32]:
-    """Observations (N, O) of a body at rest at positions (N, 2) in metres, an ant upright as its episodes begin."""
+    """Return observations (N, O) of a body at rest at positions (N, 2) in metres, an ant upright."""
     observations = np.zeros((len(np.asarray(points)), task.observation_dim), np.float32)
     observations[:, :2] = points
     for column, value in body_of(task).rest.items():
@@ -119,9 +119,9 @@ def at_rest(task: Task, points: ArrayLike) -> NDArray[np.float32]:
 
 
 def junctions(task: Task, count: int = 8) -> tuple[Cell, ...]:
-    """A maze's start, then cells with several ways out, each as far as can be from those before it.
+    """Return a maze's start, then cells with several ways out, each as far as possible from those before it.
 
-    The goal's cell is left out: there every episode is over at once.
+    The goal's cell is left out, because an episode ends there at once.
     """
     free = set(task.free_cells()) - {task.goal_cell}
 
@@ -131,7 +131,7 @@ def junctions(task: Task, count: int = 8) -> tuple[Cell, ...]:
 
     assert task.start_cell is not None, "mazes have a start"
     chosen = [task.start_cell]
-    for least in (3, 2, 1):  # where several ways lead on, skills differ most
+    for least in (3, 2, 1):  # skills differ most where several ways lead on
         places = [place for place in task.free_cells() if place in free and ways(place) >= least]
         while len(chosen) < min(count, len(free)) and (rest := [p for p in places if p not in chosen]):
             chosen.append(max(rest, key=lambda p: min(abs(p[0] - c[0]) + abs(p[1] - c[1]) for c in chosen)))

@@ -1,6 +1,6 @@
-"""Tables that say what each code is: how much of the data it holds, what happens under it, what follows it.
+"""Tables that describe each code: its share of the data, what happens under it, what follows it.
 
-Everything is counted over segments of the data that do not overlap (one every H steps), encoded as relabelling does.
+Everything is computed over segments of the data that do not overlap (one every H steps), encoded as in relabelling.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from dds_lightning.skill import SkillModule
 
 STILL = 1e-3
-"""Metres: a half of a segment that moves less has no direction, so no turn is counted."""
+"""In metres: half a segment that moves less than this has no direction, so no turn is counted."""
 BOUND = 1e-3
-"""An action this near to its bound, as a share of the box, counts as at the bound."""
+"""An action this close to its bound, as a share of the box, counts as at the bound."""
 
 Floats = NDArray[np.float64]
 
@@ -36,9 +36,9 @@ class CodedSegments:
     """M segments of the data with their codes.
 
     Attributes:
-        trajectories: the episodes that they are of.
-        relabelled: the segments; `rewards` are undiscounted sums in the task's own unit.
-        lengths: (M,) steps of each, H or fewer before a termination.
+        trajectories: The episodes that they come from.
+        relabelled: The segments; `rewards` are undiscounted sums in the task's unit.
+        lengths: (M,) steps of each; fewer than H before a termination.
         horizon: H.
     """
 
@@ -54,7 +54,7 @@ class CodedSegments:
 
     @property
     def observations(self) -> NDArray[np.float32]:
-        """(M, O) in which each segment begins."""
+        """(M, O) where each segment begins."""
         return self.relabelled.observations.numpy()
 
     @property
@@ -68,7 +68,7 @@ class CodedSegments:
         return np.bincount(self.codes, minlength=self.num_skills) / len(self.codes)
 
     def steps(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Steps (M, H) and observation rows (M, H + 1) of the segments; short ones repeat their last."""
+        """Return steps (M, H) and observation rows (M, H + 1) of the segments; short ones repeat their last."""
         starts = self.relabelled.starts.numpy()
         rows = starts + self.relabelled.episodes.numpy()
         span = np.minimum(np.arange(self.horizon), self.lengths[:, None] - 1)
@@ -82,14 +82,14 @@ def code_segments(
     """Encode a data set, one segment every H steps.
 
     Args:
-        skill: a discrete skill model.
-        trajectories: the data.
-        segments: about this many; of more data, episodes are drawn.
-        seed: of their draw.
+        skill: A discrete skill model.
+        trajectories: The data.
+        segments: Approximate number of segments; if the data have more, episodes are drawn.
+        seed: Seed of the draw.
 
     Raises:
-        UserError: a model of other widths, or with continuous skills.
-        DataError: no episode has H steps.
+        UserError: The model's widths do not fit, or its skills are continuous.
+        DataError: No episode has H steps.
     """
     order = np.random.default_rng(seed).permutation(trajectories.num_episodes)
     enough = int(np.searchsorted(np.cumsum(trajectories.lengths[order]), segments * skill.horizon)) + 1
@@ -105,13 +105,13 @@ def code_segments(
 
 
 def segment_effects(task: Task | None, segments: CodedSegments) -> pd.DataFrame:
-    """What each segment does, a row each.
+    """Return what each segment does, one row per segment.
 
     Returns:
-        In a maze `dx`, `dy` (m), `distance` (m, as the crow flies), `speed` (m/s, along the path), `turn` (degrees
-        from the way of its first half to that of its second, left is positive; NaN when it stands); of an ant also
-        `ahead` and `left` (m), as it faces when the segment begins. Of a runner `dx`
-        (m, from its velocity), `dz`, `distance`, `speed`, `turn` (degrees of pitch). Elsewhere `distance`, the norm of
+        In a maze `dx`, `dy` (m), `distance` (m, in a straight line), `speed` (m/s, along the path), `turn` (degrees
+        between the directions of its two halves, left is positive; NaN if it stands still); for an ant also `ahead` and
+        `left` (m), as it faces when the segment begins. For a runner `dx` (m, from its velocity), `dz`, `distance`,
+        `speed`, `turn` (degrees of pitch). Elsewhere `distance`, the norm of
         the change of what moves (in the kitchen its arm's joints, rad), and `speed`. Then `reward` (of the segment,
         undiscounted), `action` (mean |a| as a share of half the box, from its middle), `change` (mean |a' - a|
         likewise) and `bound` (share of actions at a bound).
@@ -157,7 +157,7 @@ def _movement(task: Task | None, seen: Floats, lengths: NDArray[np.int64], secon
 
 
 def _turn(path: Floats) -> Floats:
-    """Degrees (M,) from the first half's way to the second's, for paths (M, H + 1, 2)."""
+    """Return the angles (M,) in degrees between the directions of the two halves of paths (M, H + 1, 2)."""
     middle = path.shape[1] // 2
     first, second = path[:, middle] - path[:, 0], path[:, -1] - path[:, middle]
     angle = np.arctan2(second[:, 1], second[:, 0]) - np.arctan2(first[:, 1], first[:, 0])
@@ -169,12 +169,12 @@ def _turn(path: Floats) -> Floats:
 
 
 def skill_table(task: Task | None, segments: CodedSegments, policy: PolicyModule | None = None) -> pd.DataFrame:
-    """One row a code: its share and the means of what its segments do.
+    """Return one row per code: its share and the means of what its segments do.
 
     Args:
-        task: what the data are of; None for unnamed data.
-        segments: of `code_segments`.
-        policy: adds `value`, mean V where the code's segments begin, and `chosen`, how likely the policy chooses the
+        task: The task of the data; None for unnamed data.
+        segments: Segments from `code_segments`.
+        policy: Adds `value`, mean V where the code's segments begin, and `chosen`, how likely the policy chooses the
             code in the states of all segments.
 
     Returns:
@@ -199,7 +199,7 @@ def skill_table(task: Task | None, segments: CodedSegments, policy: PolicyModule
 
 @torch.inference_mode()
 def _policy_answers(policy: PolicyModule, observations: NDArray[np.float32]) -> tuple[Floats, Floats]:
-    """V (M,) and the policy's probabilities (M, K)."""
+    """Return V (M,) and the policy's probabilities (M, K)."""
     policy.eval()
     device = next(policy.parameters()).device
     values, chances = [], []
@@ -211,7 +211,7 @@ def _policy_answers(policy: PolicyModule, observations: NDArray[np.float32]) -> 
 
 
 def transition_matrix(segments: CodedSegments) -> Floats:
-    """How often code j follows code i in the data, (K, K) with rows that add up to 1; NaN rows without any.
+    """Return how often code j follows code i in the data, (K, K) with rows that sum to 1, or NaN if i has no successor.
 
     A segment is followed by the one that begins where it ends, in the same episode.
     """
@@ -225,14 +225,14 @@ def transition_matrix(segments: CodedSegments) -> Floats:
 
 
 def code_distances(skill: SkillModule) -> Floats:
-    """Euclidean distances between the codebook's vectors, (K, K)."""
+    """Return the Euclidean distances between the codebook's vectors, (K, K)."""
     codebook: Any = skill.bottleneck
     vectors = codebook.vectors.detach().double()
     return torch.cdist(vectors, vectors).cpu().numpy()
 
 
 def nearest_codes(distances: NDArray[Any]) -> NDArray[np.int64]:
-    """The nearest other code of each, (K,), from `code_distances`."""
+    """Return the nearest other code of each, (K,), from `code_distances`."""
     return (distances + np.diag(np.full(len(distances), np.inf))).argmin(axis=1)
 
 
@@ -244,18 +244,19 @@ def decoder_diversity(
     noise_scale: float | None = None,
     seed: int = 0,
 ) -> pd.DataFrame:
-    """How much noise alone changes an action, and how much the code does, in the same states.
+    """Measure how much noise alone changes an action, and how much the code does, in the same states.
 
     Args:
-        skill: a discrete skill model.
+        skill: A discrete skill model.
         observations: (S, O) states.
-        draws: of noise, for each state and code.
-        noise_scale: factor on the noise; None takes the model's own.
-        seed: of the noise.
+        draws: Draws of noise for each state and code.
+        noise_scale: Factor on the noise; None takes the model's.
+        seed: Seed of the noise.
 
     Returns:
-        A row a code: `code`; `spread`, the standard deviation of an action over noise; `apart`, how far the code's mean
-        action lies from the mean over all codes (root mean square); both of one action entry, in half action boxes.
+        One row per code: `code`; `spread`, the standard deviation of an action over noise; `apart`, how far the code's
+        mean action lies from the mean over all codes (root mean square); both of one action entry, in half action
+        boxes.
     """
     device = next(skill.parameters()).device
     box: Any = skill.action_box
@@ -272,12 +273,12 @@ def decoder_diversity(
 
 
 def telling_dimensions(observations: NDArray[Any], codes: NDArray[Any], count: int = 2) -> list[int]:
-    """The dimensions of the observations by which codes are told apart best.
+    """Return the dimensions of the observations that distinguish codes best.
 
     Args:
         observations: (M, O).
         codes: (M,).
-        count: of dimensions; O at most.
+        count: Number of dimensions; O at most.
 
     Returns:
         Columns, the best first: those with the largest share of variance between codes (eta squared).

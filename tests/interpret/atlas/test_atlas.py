@@ -67,11 +67,11 @@ def maze():
     players = [Contestant("policy", agent.variant("sample"), 2), single_skills(agent, 2)]
     result = rollout(short, players, workers=0, progress=False, record=True)
     others = [("continuous skills, clustered", tiny_skill(MAZE, bottleneck="gaussian"))]
-    told: list[str] = []
+    messages: list[str] = []
     made = make_atlas(
-        agent, MAZE, recorded(MAZE, 100), result, "policy", "single skill", others, states=3, tell=told.append
+        agent, MAZE, recorded(MAZE, 100), result, "policy", "single skill", others, states=3, announce=messages.append
     )
-    assert "replaying the skills" in told
+    assert "replaying the skills" in messages
     return made
 
 
@@ -145,7 +145,7 @@ def test_the_page_tells_the_numbers_of_the_table(maze):
     rows = len(read.all("article"))
     assert rows == len(maze.clips)
     found, words = maze.recovery, " ".join(read.words.split())
-    assert f"given the same code in {100 * maze.trip.accuracy:.1f} %" in words
+    assert f"gets the same code in {100 * maze.trip.accuracy:.1f} %" in words
     assert f"recovered in {100 * found.accuracy:.1f} %" in words
     assert f"chance is {100 * found.chance:.1f} %" in words
     for share in maze.table["share"]:

@@ -128,8 +128,8 @@ def test_the_kitchen_counts_subtasks_that_were_ever_done() -> None:
             columns, values = SUBTASKS[name]
             observations[row, list(columns)] = values
     figure = plot_dataset(trajectories(task, [11, 11, 11], observations=observations), task)
-    assert heights(panel(figure, "subtasks an episode does"))[0] == [1, 1, 1, 0, 0]
-    done = widths(panel(figure, "episodes that do it"))
+    assert heights(panel(figure, "subtasks completed in an episode"))[0] == [1, 1, 1, 0, 0]
+    done = widths(panel(figure, "episodes that complete it"))
     assert done == {"microwave": 2, "kettle": 0, "bottom burner": 0, "light switch": 1}  # row 0: before any step
 
 

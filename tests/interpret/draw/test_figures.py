@@ -216,7 +216,9 @@ def test_a_critic_that_knows_nothing_yet_can_be_drawn():
 
 
 def test_an_unknown_contestant_is_named_with_the_known_ones(result):
-    with pytest.raises(UserError, match="no contestant 'X' in the table, only AWR policy, single skill, cloning"):
+    with pytest.raises(
+        UserError, match="actor is 'X', expected one of the contestants in the table: AWR policy, single skill, cloning"
+    ):
         plot_trajectories(TASK, result, "X")
 
 

@@ -153,7 +153,7 @@ def test_continuous_skills_get_codes_by_the_nearest_centre(data):
 
 
 def test_what_cannot_be_clustered_is_refused(data):
-    with pytest.raises(UserError, match="discrete already"):
+    with pytest.raises(UserError, match="already discrete"):
         cluster_skills(tiny_skill(MAZE), data, 4)
     with pytest.raises(UserError, match=r"clusters is 60, but the data have only \d+ segments"):
         cluster_skills(tiny_skill(MAZE, bottleneck="gaussian"), data, 60)
