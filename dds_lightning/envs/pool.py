@@ -7,11 +7,11 @@
 ```
 
 Each slot plays a fixed list of seeds in order, so short episodes are never over-counted; a slot whose list is
-finished is no longer stepped. Workers are plain `python -c` children: they work from
-notebooks, from scripts without a `__main__` guard and under pytest, import no torch, and end when their
-caller does, because their input ends. gymnasium's and stable-baselines3's vector environments offer none of this: they
-choose the seeds of later episodes themselves, step every slot until the end, and their processes need a `__main__`
-guard. They do suit endless data, as in online training.
+finished is no longer stepped. Workers are plain `python -c` children: they work from notebooks, from scripts without a
+`__main__` guard and under pytest, do not import torch, and end when their caller does, because their input ends.
+gymnasium's and stable-baselines3's vector environments offer none of this: they choose the seeds of later episodes
+themselves, step every slot until the end, and their processes need a `__main__` guard. They do suit endless data, as in
+online training.
 """
 
 from __future__ import annotations

@@ -146,7 +146,7 @@ def test_an_interrupted_run_goes_on_and_ends_with_the_same_bits(finished, capsys
     status, _, err = call(capsys, "--out", out, *SMALL, *long)
     sender.join()
     assert status == 130
-    assert "the same command goes on" in err
+    assert "the same command continues" in err
     stopped = torch.load(checkpoint, weights_only=True)["global_step"]
     assert 3 <= stopped < 100
     status, said, err = call(capsys, "--out", out, *SMALL, *long)
