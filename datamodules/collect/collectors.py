@@ -45,9 +45,10 @@ def refuse_uncollectable(task: Task) -> None:
     """
     if not can_collect(task):
         known = ", ".join(f"{family}-...{f'@{physics}' if physics else ''}" for family, physics in COLLECTORS)
+        fetch = f", or get D4RL's own with `dds data fetch {task.base_name}`" if "d4rl" in task.data_ids else ""
         raise UserError(
-            f"data: nothing collects data for task '{task.name}' yet, only for {known}: give --data "
-            f"d4rl:FILE or --data minari:ID, or get D4RL's own with `dds data fetch {task.base_name}`"
+            f"data: nothing collects data for task '{task.name}' yet, only for {known}: give --data arrays:DIR, "
+            f"d4rl:FILE or minari:ID{fetch}"
         )
 
 
