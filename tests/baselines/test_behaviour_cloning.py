@@ -120,8 +120,7 @@ def test_fit_clone_writes_a_checkpoint_that_acts_alike_and_is_not_trained_twice(
         "truncations": np.arange(steps) == steps - 1,
     }
     data = Trajectories.from_episodes("two", [episode] * 2)
-    monkeypatch.setattr(datamodules.segments, "resolve_task", lambda spec, task: task)
-    monkeypatch.setattr(datamodules.segments, "load_trajectories", lambda spec, task: data)
+    monkeypatch.setattr(datamodules.segments, "load_trajectories", lambda spec, task: data.for_task(task))
     options = {"steps": 4, "batch_size": 16, "hidden_dims": [8], "progress": False}
     path = fit_clone(task, "local:anything", tmp_path / "clone", **options)
     assert path == tmp_path / "clone" / "last.ckpt"

@@ -46,8 +46,9 @@ def test_every_collector_serves_the_tasks_that_it_is_registered_for() -> None:
 def test_a_task_without_a_collector_says_where_data_come_from(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(collectors, "COLLECTORS", {})
     for name in task_names():
-        with pytest.raises(UserError, match=rf"'{name}'.*d4rl:FILE.*minari:ID.*dds data fetch {name}"):
+        with pytest.raises(UserError, match=rf"'{name}'.*arrays:DIR, d4rl:FILE or minari:ID") as refused:
             refuse_uncollectable(get_task(name))
+        assert (f"dds data fetch {name}" in str(refused.value)) == ("d4rl" in get_task(name).data_ids)
         assert behaviour_controller(get_task(name)) is None
 
 

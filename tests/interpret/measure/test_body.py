@@ -94,7 +94,7 @@ def test_the_outline_of_a_limb_is_as_wide_as_the_limb(hopper):
 
 
 def test_a_strobe_of_nothing_is_refused(hopper):
-    with pytest.raises(UserError, match="expected at least one skill"):
+    with pytest.raises(UserError, match="expected at least 1 of each"):
         plot_strobes(HOPPER, {}, 5)
     with pytest.raises(UserError, match="every is 0"):
         plot_strobes(HOPPER, {0: hopper}, 0)
