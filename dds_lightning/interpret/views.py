@@ -1,7 +1,7 @@
 """One row per robot: how it is drawn, and in which units and terms its movement is described.
 
-A new robot needs a row here and one in `tasks.bodies`; a robot without a row is drawn from the side, as a body of
-limbs.
+A new robot needs a row here and one in `tasks.bodies`; a robot without a row is drawn as a body of limbs, from
+where these spread most.
 """
 
 from __future__ import annotations
@@ -82,6 +82,11 @@ VIEWS = {
     ),
 }
 """Name of a robot -> how it is drawn."""
+
+
+def has_view(task: Task) -> bool:
+    """Whether somebody has said how a task's robot is drawn."""
+    return body_name(task) in VIEWS
 
 
 def view_of(task: Task) -> View:

@@ -1,11 +1,15 @@
 """A new robot is two rows: its columns and its picture; then it is replayed, drawn and has an atlas."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from dds_lightning.interpret.atlas.build import make_atlas
 from dds_lightning.interpret.draw import rendering
-from dds_lightning.interpret.measure.replay import play_skills
+from dds_lightning.interpret.draw.strobe import plot_strobes
+from dds_lightning.interpret.measure.body import body_frames
+from dds_lightning.interpret.measure.replay import play_skills, simulator
 from dds_lightning.interpret.measure.states import Played, body_states, draw_states
 from dds_lightning.interpret.views import VIEWS, View, view_of
 from dds_lightning.tasks import get_task
@@ -60,6 +64,16 @@ def test_a_robot_without_rows_is_replayed_from_states_that_its_skills_reach(monk
     np.testing.assert_array_equal(again.qpos, played.qpos)
     made = make_atlas(type(agent)(agent.skill, None, "random"), POLE, played, states=2)
     assert made.table["again"].notna().any()
+
+
+def test_a_robot_without_a_view_is_drawn_from_where_it_moves_and_an_arm_is_where_its_tip_is():
+    task = replace(POLE, name="arm", env_id="Reacher-v5", observation_dim=10, action_dim=2)
+    with simulator(task) as env:
+        qpos = np.array([[0.0, 0.0, 0.1, 0.1], [np.pi / 2, 0.0, 0.1, 0.1]])
+        body = body_frames(env.unwrapped.model, qpos)
+    np.testing.assert_allclose(body.root[:, :2], [[0.21, 0.0], [0.0, 0.21]], atol=1e-6)  # two links of 0.1 m, and more
+    figure = plot_strobes(task, {0: body}, 1)
+    assert (figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()) == ("x (m)", "y (m)")
 
 
 @pytest.mark.parametrize(

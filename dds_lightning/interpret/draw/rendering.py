@@ -118,7 +118,7 @@ def _render(facts: str, qpos: NDArray[np.float64], width: int, height: int) -> N
     import mujoco
 
     from dds_lightning.interpret.measure.replay import simulator
-    from dds_lightning.interpret.views import view_of
+    from dds_lightning.interpret.views import has_view, view_of
     from dds_lightning.tasks import restore_task
 
     mujoco.GLContext(16, 16).free()  # without a driver the process ends here, before anything slow
@@ -131,13 +131,17 @@ def _render(facts: str, qpos: NDArray[np.float64], width: int, height: int) -> N
         renderer = mujoco.Renderer(model, height, width)
         camera = mujoco.MjvCamera()
         view = view_of(task)
-        camera.distance, camera.azimuth, camera.elevation = view.camera
+        if has_view(task):
+            camera.distance, camera.azimuth, camera.elevation = view.camera
+        else:
+            mujoco.mjv_defaultFreeCamera(model, camera)
         frames = []
         for row in qpos:
             data.qpos[:] = row
             mujoco.mj_forward(model, data)
             torso = data.xpos[model.jnt_bodyid[0]]
-            camera.lookat[:] = view.looks_at or (torso[0], torso[1], view.eye)
+            if has_view(task):
+                camera.lookat[:] = view.looks_at or (torso[0], torso[1], view.eye)
             renderer.update_scene(data, camera)
             frames.append(renderer.render().copy())
     return np.stack(frames) if frames else np.zeros((0, height, width, 3), np.uint8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -19,7 +20,7 @@ from dds_lightning.interpret.draw.drawing import LABEL, TICKS, draw_walls, grid,
 from dds_lightning.interpret.draw.gif import CachedBackground, gif_bytes
 from dds_lightning.interpret.draw.palette import NO_SKILL, WALL, skill_colour
 from dds_lightning.interpret.measure.body import BodyFrames
-from dds_lightning.interpret.views import View, view_of
+from dds_lightning.interpret.views import View, has_view, view_of
 from dds_lightning.tasks import Task
 
 WIDTH = 7.0
@@ -56,7 +57,7 @@ def plot_strobes(
     """
     if not frames or every < 1:
         raise UserError(f"frames has {len(frames)} skills and every is {every}, expected at least 1 of each")
-    view = view_of(task)
+    view = _view(task, list(frames.values()))
     seconds = task.step_seconds if step_seconds is None else step_seconds
     low, high = _window(view, list(frames.values()))
     across, up = high - low
@@ -79,7 +80,7 @@ def plot_strobes(
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
         ax.tick_params(labelsize=TICKS - 2)
         falls = view.ground and len(body) < max(map(len, frames.values()))
-        heading(ax, code, _moved(task, body, seconds, falls))
+        heading(ax, code, _moved(view, body, seconds, falls))
         ax.set_xlabel(view.labels[0], fontsize=LABEL - 2)
         ax.set_ylabel(view.labels[1], fontsize=LABEL - 2)
         ax.yaxis.set_major_locator(MaxNLocator(nbins=5))
@@ -104,7 +105,7 @@ def body_clip(
         size: Width in inches at 80 dots per inch.
         seconds: Seconds per step; 0 takes the task's.
     """
-    view, seconds = view_of(task), seconds or task.step_seconds
+    view, seconds = _view(task, [body]), seconds or task.step_seconds
     shown = np.unique(np.linspace(0, len(body) - 1, min(frames, len(body))).round().astype(int))
     follows = view.ground
     low, high = _window(view, [_centred(body) if follows else body])
@@ -141,6 +142,16 @@ def body_clip(
 
 
 # ---------------------------------------------------------------------- parts
+
+
+def _view(task: Task, bodies: list[BodyFrames]) -> View:
+    """A task's view; of a robot without one, from where its limbs spread most."""
+    view = view_of(task)
+    if has_view(task):
+        return view
+    spread = np.ptp(np.concatenate([body.limbs.reshape(-1, 3) for body in bodies]), axis=0)
+    right, up = np.sort(np.argsort(spread)[1:])
+    return replace(view, axes=(int(right), int(up)))
 
 
 def _scene(ax: Axes, task: Task, view: View, body: BodyFrames) -> None:
@@ -208,9 +219,9 @@ def _travel(view: View, body: BodyFrames, t: int) -> str:
     return f"{away[0]:+.2f} m" if view.ground else f"{np.linalg.norm(away):.2f} m"
 
 
-def _moved(task: Task, body: BodyFrames, seconds: float, falls: bool) -> str:
+def _moved(view: View, body: BodyFrames, seconds: float, falls: bool) -> str:
     """Describe a panel: how long, how far, how fast, or that the body falls."""
-    view, last = view_of(task), len(body) - 1
+    last = len(body) - 1
     away = (body.root[-1] - body.root[0])[list(view.axes)]
     far = away[0] if view.ground else np.linalg.norm(away)
     what = "hand moves" if len(body.names) else "moves"

@@ -96,8 +96,11 @@ class _Skeleton:
         self.objects: list[NDArray[np.int64]] = []  # geoms of each movable thing
         self.names: tuple[str, ...] = ()
         body = model.jnt_bodyid
-        self.body = int(body[0])  # a torso
-        hinges = np.flatnonzero((model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE) & (body != self.body))
+        self.body = torso = int(body[0])
+        if model.jnt_type[0] == mujoco.mjtJoint.mjJNT_HINGE and model.body_parentid[torso] == 0:
+            # An arm on a fixed base is where its tip is.
+            self.body = int(np.flatnonzero(model.body_rootid == torso)[-1])
+        hinges = np.flatnonzero((model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE) & (body != torso))
         self.widths = 2 * model.geom_size[self.geoms, 0]
         if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "panda0_link1") >= 0:
             # The kitchen's arm is made of meshes: its limbs are the lines from joint to joint.
