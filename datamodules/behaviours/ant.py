@@ -110,6 +110,16 @@ def _in_frame(vectors: Array, forward: Array) -> Array:
     return np.stack([cosine * x + sine * y, cosine * y - sine * x], axis=1)
 
 
+def check_physics(physics: str) -> None:
+    """Refuse a physics that is not one of `PHYSICS`.
+
+    Raises:
+        UserError: There is no such physics.
+    """
+    if physics not in PHYSICS:
+        raise UserError(f"physics: got '{physics}', expected one of {', '.join(PHYSICS)}")
+
+
 class AntController:
     """A controller that walks in commanded directions.
 
@@ -123,8 +133,7 @@ class AntController:
     """
 
     def __init__(self, physics: str, directory: str | Path | None = None) -> None:
-        if physics not in PHYSICS:
-            raise UserError(f"physics: got '{physics}', expected one of {', '.join(PHYSICS)}")
+        check_physics(physics)
         self.policy = MLPPolicy.load(Path(directory or SHIPPED / "ant") / f"{physics}.safetensors")
 
     def act(self, observations: ArrayLike, headings: ArrayLike) -> Array:

@@ -17,8 +17,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from datamodules.behaviours.ant import FEATURES, PHYSICS, motor_actions, rotation_matrices, see
-from dds_lightning.errors import UserError
+from datamodules.behaviours.ant import FEATURES, check_physics, motor_actions, rotation_matrices, see
 
 Array = NDArray[np.float64]
 
@@ -94,8 +93,7 @@ def ant_simulator(physics: str) -> tuple[mujoco.MjModel, float]:
     Raises:
         UserError: There is no such physics.
     """
-    if physics not in PHYSICS:
-        raise UserError(f"physics: got '{physics}', expected one of {', '.join(PHYSICS)}")
+    check_physics(physics)
     if physics == "d4rl":
         from dds_lightning.envs.antmaze import TORQUE, D4RLAntMazeEnv
 
