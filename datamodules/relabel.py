@@ -280,9 +280,7 @@ def relabel(
     finally:
         skill.train(was_training)
 
-    assert settled.reward_scale is not None
-    assert settled.reward_shift is not None
-    learning = settled.reward_scale * (trajectories.rewards.astype(np.float64) + settled.reward_shift)  # (N,)
+    learning = settled.learning_rewards(trajectories, horizon)  # (N,)
     gamma = settled.gamma
     rewards = np.zeros(len(starts))
     for i in range(horizon):

@@ -67,8 +67,9 @@ def start_from(module: StageModule, path: str) -> None:
         # Running averages begin at the vectors, or the first step would reset those to random ones.
         theirs["bottleneck.ema_sum"] = theirs["bottleneck.vectors"].clone()
         theirs["bottleneck.ema_count"] = torch.ones_like(ours["bottleneck.ema_count"])
-    misfits = [name for name, value in ours.items() if name not in theirs or theirs[name].shape != value.shape]
     left = {name for name in ours if name in module.OF_DATA}
+    shapes = {name: value.shape for name, value in theirs.items()}
+    misfits = [name for name, value in ours.items() if name not in left and shapes.get(name) != value.shape]
     if module.hparams.get("refit_normaliser") or any(name.startswith(STATISTICS) for name in misfits):
         left |= {name for name in ours if name.startswith(STATISTICS)}
     frozen = tuple(f"{name}." for name in module.frozen_modules)

@@ -45,7 +45,7 @@ def td(q_values: Tensor, target: Tensor) -> Tensor:
     return (q_values - target).square().mean(dim=-1).sum()
 
 
-def awr_weights(advantages: Tensor, alpha: float, clip: float) -> Tensor:
+def awr_weights(advantages: Tensor, alpha: float | Tensor, clip: float) -> Tensor:
     """Regression weights ``min(exp(alpha A), clip)`` of equation 9; (B,)."""
     # exp of a large number is inf, and min(inf, clip) is clip: no overflow reaches the loss.
     return (alpha * advantages).exp().clamp_max(clip)

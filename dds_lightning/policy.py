@@ -30,9 +30,11 @@ import dds_lightning.losses as losses
 from dds_lightning.module import StageModule
 from dds_lightning.nn.mlp import MLP, FourierFeatures
 from dds_lightning.nn.normaliser import Normaliser
+from dds_lightning.nn.watch import complaints
 
 Selection = Literal["sample", "greedy", "argmax_q"]
 Solution = Literal["regression", "closed_form"]
+Unit = Literal["reward", "spread"]
 Loss = tuple[Tensor, dict[str, Tensor]]  # a scalar to minimise, and statistics to log beside it
 STATISTICS = ("observation_mean", "observation_std", "code_share", "reward_range", "max_discount")
 
@@ -64,7 +66,9 @@ class PolicyModule(StageModule):
         fourier_seen: How many leading numbers of the observation they see, for example 2 for a position that comes
             before many joints: a moving leg must not hide where the robot is. 0 for all.
         tau: Expectile of the value loss.
-        alpha: Temperature of AWR; larger follows the critic more closely. Choose it together with the reward scale.
+        alpha: Temperature of AWR; larger follows the critic more closely.
+        alpha_unit: Unit of the advantages: of the learning ``reward`` (the paper), or their ``spread``, the standard
+            deviation of advantages over the data, so that the policy does not depend on the rewards' scale.
         weight_clip: Upper bound of the AWR weights; not used by ``closed_form``, whose weights are equal.
         awr: ``regression`` on the codes of the data (the paper), or ``closed_form``, the policy that the regression
             would find with infinite data (named departure from the paper); `alpha` may then change at any time.
@@ -94,9 +98,10 @@ class PolicyModule(StageModule):
     PARTS: ClassVar = {"critic": ("value", "critic", "target_critic"), "actor": ("actor",)}
     # `awr` belongs to the weights: with `closed_form` the actor is beta.
     SHAPE = ("num_skills", "hidden_dims", "layer_norm", "fourier_features", "fourier_scale", "fourier_seen", "awr")
-    OF_DATA = ("support_mask", "value_range")
+    OF_DATA = ("support_mask", "value_range", "advantage_spread")
     support_mask: Tensor
     value_range: Tensor
+    advantage_spread: Tensor
 
     def __init__(
         self,
@@ -109,6 +114,7 @@ class PolicyModule(StageModule):
         fourier_seen: int = 0,
         tau: float = 0.7,
         alpha: float = 3.0,
+        alpha_unit: Unit = "reward",
         weight_clip: float = 100.0,
         awr: Solution = "regression",
         beta_floor: float = 0.01,
@@ -134,6 +140,7 @@ class PolicyModule(StageModule):
             ("fourier_seen", 0 <= fourier_seen <= observation_dim, f"in [0, {observation_dim}]"),
             ("tau", 0 < tau < 1, "in (0, 1)"),
             ("alpha", alpha >= 0, "0 or more"),
+            ("alpha_unit", alpha_unit in get_args(Unit), " or ".join(get_args(Unit))),
             ("weight_clip", weight_clip > 0, "positive"),
             ("awr", awr in get_args(Solution), " or ".join(get_args(Solution))),
             ("beta_floor", 0 <= beta_floor < 1 / num_skills, f"in [0, 1/{num_skills})"),
@@ -157,6 +164,8 @@ class PolicyModule(StageModule):
         # Filled when a fit starts: which codes the data support, and which values rewards and discounts allow.
         self.register_buffer("support_mask", torch.ones(num_skills, dtype=torch.bool))
         self.register_buffer("value_range", torch.tensor([-torch.inf, torch.inf]))
+        if alpha_unit == "spread":
+            self.register_buffer("advantage_spread", torch.ones(()))  # a running mean over training batches
         self._begin(init_from)
 
     def embed(self, observations: Tensor) -> Tensor:
@@ -178,7 +187,7 @@ class PolicyModule(StageModule):
         if self.hparams.awr == "regression":
             return scores
         beta = scores.softmax(dim=-1)
-        scores = scores + self.hparams.alpha * (self._target_q(features) - self.value(features))
+        scores = scores + self.inverse_temperature * (self._target_q(features) - self.value(features))
         return scores.masked_fill(beta < self.hparams.beta_floor, -torch.inf)
 
     def codes(
@@ -206,6 +215,12 @@ class PolicyModule(StageModule):
             return logits.argmax(dim=-1)
         probabilities = (logits / temperature).softmax(dim=-1)
         return torch.multinomial(probabilities, 1, generator=generator).squeeze(-1)
+
+    @property
+    def inverse_temperature(self) -> Tensor | float:
+        """Factor on advantages in the exponent of equation 9: `alpha` in the unit of the learning rewards."""
+        alpha: float = self.hparams.alpha
+        return alpha if self.hparams.alpha_unit == "reward" else alpha / self.advantage_spread.clamp_min(1e-6)
 
     def _target_q(self, features: Tensor) -> Tensor:
         """Features (B, F) to the smaller target Q of every code (B, K)."""
@@ -242,7 +257,7 @@ class PolicyModule(StageModule):
         log_pi = self.actor(judged.features).log_softmax(dim=-1).gather(-1, codes[:, None]).squeeze(-1)  # (B,)
         if h.awr == "closed_form":
             return losses.awr(log_pi, torch.ones_like(log_pi)), {"clipped_share": log_pi.new_zeros(())}
-        weights = losses.awr_weights((judged.q - judged.v).detach(), h.alpha, h.weight_clip)
+        weights = losses.awr_weights((judged.q - judged.v).detach(), self.inverse_temperature, h.weight_clip)
         statistics = {
             "clipped_share": (weights >= h.weight_clip).float().mean(),
             "effective_sample_size": losses.effective_sample_size(weights),
@@ -261,6 +276,7 @@ class PolicyModule(StageModule):
             terms["actor_loss"] = self.actor_loss
         total = features.new_zeros(())
         info = {"v_mean": v.mean(), "v_min": v.min(), "v_max": v.max(), "q_mean": q.mean()}
+        info["advantage_std"] = (q - v).std(correction=0)
         for name, term in terms.items():
             value, statistics = term(judged)
             total = total + value
@@ -304,30 +320,13 @@ class PolicyModule(StageModule):
     def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """One optimiser step's loss."""
         total, self.terms = self.loss(batch)
+        if self.hparams.alpha_unit == "spread":  # at first the mean of all batches, then of the last few hundred
+            self.advantage_spread.lerp_(self.terms["advantage_std"], max(0.005, 1.0 / (1 + self.global_step)))
         self.log_training(total)
         if self.global_step % self.hparams.watch == 0:
-            self._watch(self.terms)
+            for message in complaints(self.terms, self.value_range, self.hparams.weight_clip):
+                warnings.warn(f"step {self.global_step}: {message}", stacklevel=1)
         return total
-
-    def _watch(self, info: dict[str, Tensor]) -> None:
-        """Warn when the critic's values cannot be sums of rewards, or when most AWR weights are clipped."""
-        low, high = self.value_range.tolist()
-        least, most = info["v_min"].item(), info["v_max"].item()
-        slack = 0.1 * (high - low) if high - low < float("inf") else float("inf")
-        clipped = info["clipped_share"].item() if "clipped_share" in info else 0.0
-        diverges = (
-            f"V runs from {least:.3g} to {most:.3g}, but the data's rewards and discounts allow only {low:.3g} to "
-            f"{high:.3g}: the critic diverges. Check that terminations are in the data, scale the rewards down, or "
-            "lower lr or tau."
-        )
-        clones = (
-            f"{100 * clipped:.0f} % of the AWR weights are clipped at {self.hparams.weight_clip:g}: the policy clones "
-            "them all alike. Lower alpha or the reward scale."
-        )
-        impossible = least < low - slack or most > high + slack
-        for wrong, message in ((impossible, diverges), (clipped > 0.5, clones)):
-            if wrong:
-                warnings.warn(f"step {self.global_step}: {message}", stacklevel=2)
 
     @torch.no_grad()
     def after_step(self, step: int) -> None:

@@ -1,7 +1,6 @@
 """Discrete IQL and AWR: on a chain whose values are known, and on hand-made batches."""
 
 import math
-import warnings
 
 import lightning.pytorch as pl
 import pytest
@@ -10,6 +9,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from torch.utils.data import DataLoader
 
 from dds_lightning.errors import UserError
+from dds_lightning.nn.watch import complaints
 from dds_lightning.policy import Judged, PolicyModule
 
 
@@ -272,23 +272,61 @@ def test_a_checkpoint_in_the_middle_of_a_run_holds_the_last_move_of_the_target(t
         assert torch.equal(value, saved[name]), name
 
 
-def test_the_watch_warns_of_values_that_no_rewards_can_sum_to():
+def test_complaints_of_values_that_no_rewards_can_sum_to():
     module = small(observation_dim=5)
     module.fit_statistics(**Chain().statistics())
     assert module.value_range.tolist() == pytest.approx([0.0, 10.0])
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        module._watch({"v_min": torch.tensor(0.0), "v_max": torch.tensor(9.9)})
-    with pytest.warns(UserWarning, match="allow only 0 to 10: the critic diverges"):
-        module._watch({"v_min": torch.tensor(0.0), "v_max": torch.tensor(25.0)})
-    with pytest.warns(UserWarning, match="80 % of the AWR weights are clipped"):
-        module._watch({"v_min": torch.tensor(0.0), "v_max": torch.tensor(1.0), "clipped_share": torch.tensor(0.8)})
+
+    def said(most: float, **more: torch.Tensor) -> list[str]:
+        return complaints({"v_min": torch.tensor(0.0), "v_max": torch.tensor(most), **more}, module.value_range, 100.0)
+
+    assert said(9.9) == []
+    (one,) = said(25.0)
+    assert "allow only 0 to 10: the critic diverges" in one
+    (one,) = said(1.0, clipped_share=torch.tensor(0.8))
+    assert "80 % of the AWR weights are clipped at 100" in one
+
+
+def test_a_training_passes_complaints_on():
+    module = small(observation_dim=5, watch=1)
+    module.value[-1].bias.data.fill_(50.0)
+    with pytest.warns(UserWarning, match="step 0: V runs from .* the critic diverges"):
+        fit(module, 1, Chain())
+
+
+@pytest.mark.parametrize("awr", ["closed_form", "regression"])
+def test_alpha_in_units_of_the_spread_of_advantages(awr):
+    """The unit is the standard deviation of target Q - V over the data; both solutions use alpha / unit."""
+    module = small(alpha=3.0, alpha_unit="spread", awr=awr)
+    data = batch(64)
+    module.fit_statistics(torch.zeros(2), torch.ones(2), torch.full((4,), 0.25), (-3.0, 3.0), 0.9)
+    with torch.no_grad():
+        q = module.q(data["observations"]).gather(1, data["codes"][:, None]).squeeze(1)
+        spread = (q - module.v(data["observations"])).std(correction=0)
+        module.advantage_spread.fill_(spread)
+        plain = small(alpha=3.0 / spread.item(), awr=awr)
+        plain.load_state_dict({k: v for k, v in module.state_dict().items() if k != "advantage_spread"})
+        torch.testing.assert_close(module.logits(data["observations"]), plain.logits(data["observations"]))
+        torch.testing.assert_close(module.loss(data)[0], plain.loss(data)[0])
+        assert module.loss(data)[1]["advantage_std"].item() == pytest.approx(spread.item())
+
+
+def test_the_spread_is_measured_while_training_and_goes_into_the_checkpoint():
+    module = small(observation_dim=5, alpha_unit="spread", lr=1e-2, target_ema=0.5)
+    fit(module, 300, Chain())
+    kept = module.state_dict()["advantage_spread"].item()
+    data = Chain().data
+    with torch.no_grad():
+        now = module.loss(data)[1]["advantage_std"].item()
+    assert kept == pytest.approx(now, rel=0.15)
+    assert "advantage_spread" not in small().state_dict()  # and older checkpoints still fit
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"num_skills": 1}, "model.num_skills is 1, expected at least 2"),
+        ({"alpha_unit": "std"}, "model.alpha_unit is std, expected reward or spread"),
         ({"tau": 1.0}, r"model.tau is 1.0, expected in \(0, 1\)"),
         ({"alpha": -1.0}, "model.alpha is -1.0"),
         ({"target_ema": 0.0}, "model.target_ema is 0.0"),

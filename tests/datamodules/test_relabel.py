@@ -19,8 +19,10 @@ from datamodules.relabelled import RelabeledDataModule
 from datamodules.relabelling import Relabelling
 from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError
+from dds_lightning.policy import PolicyModule
 from dds_lightning.skill import SkillModule
 from dds_lightning.tasks import get_task
+from tests.modules import fit
 
 SMALL = {"hidden_dim": 16, "encoder_layers": 1, "encoder_heads": 2, "decoder_blocks": 1, "skill_dim": 8}
 
@@ -343,3 +345,69 @@ def test_the_name_of_a_cached_file_is_that_of_earlier_versions(trajectories, ski
     assert json.dumps(made.key) == json.dumps(key)
     name = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:16]
     assert made.cache_file().name == f"relabelled-{name}.safetensors"
+
+
+def timed_out(rewards: list[list[float]]) -> Trajectories:
+    """Episodes with these rewards that all end by time-out."""
+    episodes = [episode(len(some), "truncated", 10.0 * i) for i, some in enumerate(rewards)]
+    return Trajectories.from_episodes(
+        "toy", [{**one, "rewards": np.array(r, np.float32)} for one, r in zip(episodes, rewards, strict=True)]
+    )
+
+
+def test_automatic_rewards_by_hand():
+    """Returns to go at gamma 1/2: (3, 4, 0) for rewards (1, 4, 0), and (0, 0, 0)."""
+    data = timed_out([[1.0, 4.0, 0.0], [0.0, 0.0, 0.0]])
+    relabelling = Relabelling(gamma=0.5, discount="per_step", reward_scale="auto")
+    spread = np.std([3.0, 4.0, 0.0, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(relabelling.learning_rewards(data, 3), np.array([1, 4, 0, 0, 0, 0]) * 10.0 / spread)
+    per_skill = Relabelling(gamma=0.125, reward_scale="auto")  # 1/8 per skill of 3 steps is 1/2 a step
+    np.testing.assert_allclose(per_skill.learning_rewards(data, 3), relabelling.learning_rewards(data, 3))
+    still = timed_out([[0.0, 0.0, 0.0]])
+    assert relabelling.learning_rewards(still, 3).tolist() == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(("factor", "constant"), [(0.1, 0.0), (10.0, 0.0), (1.0, 7.0), (0.1, -3.0)])
+def test_automatic_rewards_do_not_depend_on_unit_and_origin(factor, constant):
+    rewards = np.random.default_rng(0).normal(2.0, 1.0, (5, 40))
+    auto = Relabelling(discount="per_step", reward_scale="auto", reward_shift="auto")
+    plain, other = timed_out(rewards.tolist()), timed_out((factor * rewards + constant).tolist())
+    np.testing.assert_allclose(auto.learning_rewards(other, 3), auto.learning_rewards(plain, 3), atol=1e-4)
+
+
+def test_where_episodes_end_for_good_their_origin_stays(trajectories):
+    """There a constant changes what it is worth to go on."""
+    scale_only = Relabelling(reward_scale="auto", reward_shift=0.0)
+    both = Relabelling(reward_scale="auto", reward_shift="auto")
+    assert trajectories.terminations.any()
+    assert both.learning_rewards(trajectories, 3).tolist() == scale_only.learning_rewards(trajectories, 3).tolist()
+
+
+def test_a_misspelt_reward_scale_is_refused():
+    with pytest.raises(UserError, match="reward_scale is 'automatic', expected a number, auto or null"):
+        Relabelling(reward_scale="automatic")
+
+
+@pytest.mark.parametrize(("factor", "constant"), [(0.1, 0.0), (10.0, 0.0), (1.0, -2.0)])
+def test_the_same_policy_whatever_the_unit_and_origin_of_rewards(skill, tmp_path, factor, constant):
+    """From data to probabilities: automatic rewards, and alpha in units of the advantages' spread."""
+    rewards = np.random.default_rng(0).normal(1.0, 2.0, (4, 30))
+    windows = timed_out(rewards.tolist()).windows(3, 1)
+    observed = torch.as_tensor(timed_out(rewards.tolist()).observations[windows.observation_starts[:, None] + range(3)])
+    skill.bottleneck.start_from(skill._encodings(observed, torch.zeros(len(observed), 3, 1)))
+    auto = {"discount": "per_step", "reward_scale": "auto", "reward_shift": "auto"}
+
+    def probabilities(values: np.ndarray) -> torch.Tensor:
+        data = module(timed_out(values.tolist()), skill, tmp_path, cache=str(tmp_path / "cache"), **auto)
+        torch.manual_seed(0)
+        learns = {"alpha": 2.0, "alpha_unit": "spread", "awr": "closed_form", "extraction": "joint"}
+        policy = PolicyModule(2, 4, hidden_dims=[16], lr=1e-2, target_ema=0.1, **learns)
+        data.prepare_data()
+        data.setup()
+        fit(policy, data, 60)
+        with torch.no_grad():
+            return policy.logits(data.transitions.observations).softmax(dim=-1)
+
+    plain, other = probabilities(rewards), probabilities(factor * rewards + constant)
+    assert plain.std(dim=0).max() > 0.01  # it learnt something
+    torch.testing.assert_close(other, plain, atol=1e-3, rtol=0.0)
