@@ -160,7 +160,9 @@ class RelabeledDataModule(pl.LightningDataModule):
         _, held_out = self.trajectories.split(h.validation_fraction, h.seed, self.skill.horizon)
         validates = torch.isin(self.transitions.episodes, torch.as_tensor(held_out))
         self.train_index = torch.nonzero(~validates).flatten()
-        self.validation_index = torch.nonzero(validates).flatten()
+        held = torch.nonzero(validates).flatten()
+        # In a random order, as in SegmentDataModule: the first batches are a fair sample of all episodes.
+        self.validation_index = held[torch.randperm(len(held), generator=torch.Generator().manual_seed(0))]
 
     def statistics(self) -> dict[str, Any]:
         """What the policy needs of the data: normalisation, code shares, range of rewards, greatest discount."""
@@ -199,7 +201,7 @@ class RelabeledDataModule(pl.LightningDataModule):
         return self._loader(self.train_index, train=True)
 
     def val_dataloader(self) -> TensorLoader | list[Any]:
-        """The held-out episodes' transitions, in order; none when ``validation_fraction`` is 0."""
+        """The held-out episodes' transitions in a fixed random order; none when ``validation_fraction`` is 0."""
         return self._loader(self.validation_index) if len(self.validation_index) else []
 
     test_dataloader = val_dataloader

@@ -140,9 +140,13 @@ class SegmentDataModule(pl.LightningDataModule):
         self.training_episodes, self.validation_episodes = data.split(self.validation_fraction, self.seed, self.horizon)
         held_out = np.isin(self._windows.episodes, self.validation_episodes)
         self.training_segments = np.flatnonzero(~held_out)
-        kept = np.flatnonzero(held_out)
-        count = min(len(kept), self.max_validation_segments)
-        self.validation_segments = kept[np.linspace(0, len(kept) - 1, count).round().astype(np.int64)]
+        self.validation_segments = np.flatnonzero(held_out)
+        if len(self.validation_segments) > self.max_validation_segments:
+            spread = np.linspace(0, len(self.validation_segments) - 1, self.max_validation_segments)
+            self.validation_segments = self.validation_segments[spread.round().astype(np.int64)]
+        # In a random order, so that the first batches, all that a training may look at, are a fair sample: in many a
+        # file the episodes of one controller come before those of another.
+        np.random.default_rng(0).shuffle(self.validation_segments)
 
     def train_dataloader(self) -> TensorLoader:
         """Shuffled, full batches, shared among processes."""
@@ -154,7 +158,7 @@ class SegmentDataModule(pl.LightningDataModule):
         )
 
     def val_dataloader(self) -> TensorLoader | list[Any]:
-        """The same segments in the same order every time; none when `validation_fraction` is 0."""
+        """The same segments in the same random order every time; none when `validation_fraction` is 0."""
         self.setup()
         return self._loader(self.validation_segments) if len(self.validation_segments) else []
 

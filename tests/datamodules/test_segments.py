@@ -185,11 +185,18 @@ def test_validation_is_the_same_every_time_and_bounded(data: Trajectories) -> No
     first, second = _batches(loader), _batches(loader)
     assert len(first["actions"]) == 7
     torch.testing.assert_close(first, second)
-    episodes = first["observations"][:, 0, 0]
-    assert (episodes[0].item(), episodes[-1].item()) == (
-        module.validation_episodes[0],
-        module.validation_episodes[-1],
-    )
+    episodes = set(first["observations"][:, 0, 0].tolist())
+    assert {module.validation_episodes[0], module.validation_episodes[-1]} <= episodes
+
+
+def test_the_first_validation_batches_are_a_fair_sample_of_all_held_out_episodes(make_episode: Make) -> None:
+    """In many a file one controller's episodes come before another's; a training looks at a few batches only."""
+    data = Trajectories.from_episodes("two controllers", [make_episode(90, int(i >= 20)) for i in range(40)])
+    module = SegmentDataModule.from_trajectories(data, horizon=4, batch_size=64, validation_fraction=0.5)
+    module.setup()
+    late = float(np.mean(np.asarray(module.validation_episodes) >= 20))
+    first = next(iter(module.val_dataloader()))["observations"][:, 0, 0]
+    assert first.mean().item() == pytest.approx(late, abs=0.2)
 
 
 def test_no_validation_when_none_is_asked_for(data: Trajectories) -> None:
