@@ -103,6 +103,11 @@ def simulator(task: Task) -> Iterator[Any]:
         yield env
 
 
+def device_of(skills: Skills) -> torch.device:
+    """Where a model expects its inputs; what is not a module is on the CPU."""
+    return next(skills.parameters()).device if isinstance(skills, torch.nn.Module) else torch.device("cpu")
+
+
 def replay_codes(
     task: Task,
     skills: Skills,
@@ -143,7 +148,7 @@ def replay_codes(
     which = np.arange(len(states)) if each else np.tile(np.arange(len(states)), len(chosen))
     held = chosen if each else np.repeat(chosen, len(states))
     index = torch.from_numpy(held)
-    device = next(skills.parameters()).device if isinstance(skills, torch.nn.Module) else torch.device("cpu")
+    device = device_of(skills)
     stream = torch.Generator(device).manual_seed(seed)
 
     @torch.inference_mode()
@@ -154,14 +159,23 @@ def replay_codes(
 
     with contextlib.ExitStack() as stack:
         env = stack.enter_context(simulator(task)) if env is None else env
-        fields = _play(env, task, act, states.take(which), steps or skills.horizon, report)
+        fields = play(env, task, act, states.take(which), steps or skills.horizon, report)
     return Replays(codes=held, states=which, **fields)
 
 
-def _play(
-    env: Any, task: Task, act: Act, states: BodyStates, steps: int, report: Callable[[int], None] | None
+def play(
+    env: Any, task: Task, act: Act, states: BodyStates, steps: int, report: Callable[[int], None] | None = None
 ) -> dict[str, NDArray[Any]]:
-    """Play N replays for T steps, or until their episode ends; returns `Replays` without codes and states."""
+    """Play N replays for T steps, or until their episode ends; returns `Replays` without codes and states.
+
+    Args:
+        env: From `simulator`.
+        task: The environment's task.
+        act: Called once a step with all replays that go on.
+        states: (N,) where they begin.
+        steps: T.
+        report: Called with the number of steps done so far.
+    """
     inner = env.unwrapped
     model, data = inner.model, inner.data
     robot = getattr(inner, "robot_env", None)
