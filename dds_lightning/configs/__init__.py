@@ -11,7 +11,7 @@ from dds_lightning.errors import UserError
 ROOT = Path(__file__).parent
 RUN_DEFAULTS: dict[str, Any] = {
     "data_steps": 200_000,
-    "clone_steps": 4000,
+    "clone_steps": 16_000,
     "selection": "sample",
     "temperature": 1.0,
     "noise_scale": None,  # the skill model's
