@@ -65,6 +65,10 @@ class Relabelling:
             reward_shift=shift if self.reward_shift is None else self.reward_shift,
         )
 
+    def step_discount(self, horizon: int) -> float:
+        """Discount of one step outside a skill: gamma, or gamma^(1/H) where a skill of H steps counts gamma."""
+        return self.gamma if self.discount == "per_step" else self.gamma ** (1.0 / horizon)
+
     def learning_rewards(self, trajectories: Trajectories, horizon: int) -> NDArray[np.float64]:
         """What the critic learns from at each step of the data, (N,).
 
@@ -81,8 +85,7 @@ class Relabelling:
         rewards += shift
         if self.reward_scale != "auto":
             return (1.0 if self.reward_scale is None else self.reward_scale) * rewards
-        gamma = self.gamma if self.discount == "per_step" else self.gamma ** (1.0 / horizon)
-        spread = float(_returns_to_go(rewards, trajectories.lengths, gamma).std())
+        spread = float(returns_to_go(rewards, trajectories.lengths, self.step_discount(horizon)).std())
         return rewards * (RETURN_SPREAD / spread if spread > 1e-12 else 1.0)
 
     def settings(self) -> dict[str, Any]:
@@ -90,7 +93,7 @@ class Relabelling:
         return asdict(self)
 
 
-def _returns_to_go(rewards: NDArray[np.float64], lengths: NDArray[np.int64], gamma: float) -> NDArray[np.float64]:
+def returns_to_go(rewards: NDArray[np.float64], lengths: NDArray[np.int64], gamma: float) -> NDArray[np.float64]:
     """Discounted sum of the rewards (N,) from each step to the end of its episode, (N,)."""
     from scipy.signal import lfilter
 

@@ -7,6 +7,7 @@
 ```
 """
 
+import warnings
 from collections.abc import Iterable
 from itertools import islice
 from typing import Any, ClassVar, Literal
@@ -330,6 +331,16 @@ class SkillModule(StageModule):
         if self.discrete:
             log.update(self.usage.compute())
         self.log_dict({f"{stage}/{name}": value for name, value in log.items()}, prog_bar=True)
+
+    def on_fit_end(self) -> None:
+        """Warn where most of the codebook is idle."""
+        used = int(self.bottleneck.health().get("codes_used", self.num_skills))
+        if 2 * used < self.num_skills:
+            warnings.warn(
+                f"only {used} of {self.num_skills} codes are in use: the policy can choose among no more. Keep "
+                "codebook_init=kmeans and restart_threshold above 0, lower lr, or ask for fewer skills",
+                stacklevel=1,
+            )
 
     def predict_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """Codes (B,) of a batch of segments."""

@@ -70,7 +70,7 @@ ROOMS = {
     "dds_lightning.interpret.atlas": "interpret.draw interpret.measure interpret.views rollout saving tasks "
     "datamodules.trajectories",
     "dds_lightning.study": "agent callbacks console errors interpret.atlas interpret.draw interpret.measure rollout "
-    "saving skill tasks datamodules.collect datamodules.relabel datamodules.sources",
+    "saving skill tasks datamodules.collect datamodules.relabel datamodules.relabelling datamodules.sources",
     "dds_lightning.sharing": "agent errors saving tasks training",
     "dds_lightning.pipeline": "agent baselines configs console errors policy rollout saving skill study tasks training "
     "datamodules.collect datamodules.inspection datamodules.relabelled datamodules.relabelling datamodules.relabel "
@@ -89,7 +89,8 @@ TYPES = {
     "dds_lightning.interpret.measure": "agent policy skill rollout",
     "dds_lightning.interpret.draw": "agent policy skill",
     "dds_lightning.interpret.atlas": "agent skill",
-    "dds_lightning.study": "datamodules.trajectories",
+    "dds_lightning.study": "baselines policy datamodules.relabelled datamodules.trajectories",
+    "datamodules.relabelling": "datamodules.trajectories",
     "dds_lightning.cli": "datamodules.trajectories",
 }
 """The same for imports that only a type checker makes."""

@@ -108,7 +108,12 @@ def test_a_presets_run_fills_in_what_was_not_asked_for(tmp_path):
     assert run_defaults(str(tmp_path)) == RUN_DEFAULTS
     (tmp_path / "run.yaml").write_text("data_steps: 1000\ntemperature: 1\nselection: greedy\n")
     wanted = RunSettings.with_preset("hopper-medium", Path("out"), str(tmp_path), selection=None, temperature=0.5)
-    assert (wanted.data_steps, wanted.selection, wanted.temperature, wanted.clone_steps) == (1000, "greedy", 0.5, 16_000)
+    assert (wanted.data_steps, wanted.selection, wanted.temperature, wanted.clone_steps) == (
+        1000,
+        "greedy",
+        0.5,
+        16_000,
+    )
     for family in ("antmaze", "kitchen", "locomotion", "paper", "pointmaze"):
         assert run_defaults(family)["data_steps"] >= 100_000
 

@@ -2,6 +2,7 @@
 
 import copy
 import itertools
+import warnings
 
 import lightning.pytorch as pl
 import pytest
@@ -113,6 +114,19 @@ def test_fitting_takes_the_datas_statistics_and_starts_the_codebook():
     assert module.normaliser.mean.tolist() == [1.0, 2.0, 3.0]
     assert module.action_box.high.tolist() == [1.0, 2.0]
     assert module.bottleneck.initted
+
+
+def test_an_idle_codebook_is_reported_at_the_end_of_a_training():
+    module = small()
+    module.bottleneck.usage.copy_(torch.tensor([1.0, 0.0, 0.0, 0.0]))
+    with pytest.warns(UserWarning, match="only 1 of 4 codes are in use"):
+        module.on_fit_end()
+    module.bottleneck.usage.fill_(0.25)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        module.on_fit_end()
+    continuous = small(bottleneck="gaussian")
+    continuous.on_fit_end()
 
 
 @pytest.fixture(scope="module")

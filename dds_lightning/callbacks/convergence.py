@@ -71,6 +71,16 @@ class Convergence(Callback):
         fall = expected_fall(self.history, self.MORE, self.FEWEST)
         return self.history[-1][0] >= self.min_steps and not math.isnan(fall) and fall < self.tolerance
 
+    def remark(self) -> str | None:
+        """Say by how much held-out loss would still fall; None where it has levelled off, or nothing is known."""
+        fall = expected_fall(self.history, self.MORE, self.FEWEST) if self.history else math.nan
+        if math.isnan(fall) or fall < self.tolerance:
+            return None
+        return (
+            f"{self.monitor} would fall by another {100 * fall:.0f} % with a quarter more steps; if the agent "
+            "disappoints, raise --trainer.max_steps"
+        )
+
     def state_dict(self) -> dict[str, Any]:
         """The curve so far."""
         return {"history": [list(point) for point in self.history]}

@@ -30,7 +30,7 @@ def run(
     temperature: float | None = None,
     noise_scale: float | None = None,
     workers: int | None = None,
-    until: Literal["data", "skill", "relabel", "policy", "clone", "evaluate", "report"] = "report",
+    until: Literal["data", "skill", "relabel", "policy", "clone", "examine", "evaluate", "report"] = "report",
     fresh: bool = False,
     **stages: list[str],
 ) -> Report:

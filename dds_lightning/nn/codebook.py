@@ -146,8 +146,9 @@ class Codebook(Bottleneck):
         return {self.vectors: self.restart_dead(encodings(), threshold, generator)}
 
     def health(self) -> Mapping[str, Tensor]:
-        """Return the ``perplexity`` of the running usage."""
-        return {"perplexity": perplexity(self.usage)}
+        """Return ``perplexity`` and ``codes_used`` of the running usage; a code in use has a tenth of 1/K or more."""
+        in_use = self.usage >= 0.1 / self.num_skills
+        return {"perplexity": perplexity(self.usage), "codes_used": in_use.sum().float()}
 
     @torch.no_grad()
     def restart_dead(self, encodings: Tensor, threshold: float, generator: torch.Generator) -> Tensor:

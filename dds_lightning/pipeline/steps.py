@@ -2,7 +2,7 @@
 
 ```
  data ─► skill ─► relabel ─► policy ─┬─► evaluate ─► report
-   └──────────► clone (baseline) ────┘
+   └──────────► clone (baseline) ────┴─► examine ──┘
 ```
 
 A new step is one more row of `STEPS`. A step may run as soon as those that it reads are done.
@@ -145,7 +145,38 @@ def _relabel(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
     return {"relabelled": module.cache_file(), "codes": folder / "codes.csv"}
 
 
-# ---------------------------------------------------------------------- evaluation and report
+# ---------------------------------------------------------------------- evidence, evaluation and report
+
+
+def _examine(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
+    """Measure what each stage is worth by itself, for the verdict."""
+    from datamodules.relabelled import RelabeledDataModule
+    from dds_lightning.baselines.behaviour_cloning import BehaviourCloning
+    from dds_lightning.policy import PolicyModule
+    from dds_lightning.skill import SkillModule
+    from dds_lightning.study import evidence
+
+    skill, wanted = run.output("skill", "checkpoint"), run.wanted
+    held_out = {"validation_fraction": run.trainings.settings("policy")["data"]["validation_fraction"]}
+    data = RelabeledDataModule(
+        run.task.name,
+        run.data_spec,
+        str(skill),
+        cache=str(run.output("relabel", "relabelled").parent),
+        seed=wanted.seed,
+        **held_out,
+        **run.trainings.relabelling(),
+    )
+    data.prepare_data()
+    data.setup()
+    clone = BehaviourCloning.load(run.output("clone", "checkpoint"))
+    noise, recorded = wanted.noise_scale, data.trajectories
+    return {
+        **evidence.data_evidence(recorded, run.task),
+        **evidence.skill_evidence(skill),
+        **evidence.fidelity_evidence(recorded, SkillModule.load(skill), clone, noise, wanted.seed),
+        **evidence.policy_evidence(data, PolicyModule.load(run.output("policy", "checkpoint"))),
+    }
 
 
 def _evaluation_settings(run: Run) -> Settings:
@@ -174,13 +205,14 @@ def _evaluate(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
     chosen: dict[str, Any] = run.facts("policy").get("chosen", {})
     skill = SkillModule.load(run.output("skill", "checkpoint"))
 
-    def agent_of(checkpoint: str) -> DDSAgent:
+    def agent_of(checkpoint: str, way: Any = wanted.selection, alpha: float | None = None) -> DDSAgent:
         policy = PolicyModule.load(run.output("policy", checkpoint))
-        way: Any = wanted.selection
+        policy.hparams.alpha = policy.hparams.alpha if alpha is None else alpha
         return DDSAgent(skill, policy, way, wanted.temperature, wanted.noise_scale, seed=wanted.seed)
 
     agent = agent_of("checkpoint")
     best = agent_of("best") if chosen else None
+    closed = agent.policy is not None and agent.policy.hparams.awr == "closed_form"
     players = contestants.final_contestants(
         agent,
         task,
@@ -189,6 +221,7 @@ def _evaluate(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
         clone=CloneActor.load(run.output("clone", "checkpoint")),
         controller=contestants.behaviour_controller(task) if wanted.data is None else None,
         best=contestants.best_ways(best, run.episodes, chosen) if best else (),
+        data_policy=agent_of("checkpoint", "sample", alpha=0.0) if closed else None,
     )
     result = rollout(task, players, seed=wanted.seed, workers=wanted.workers, record=True)
     result.save(folder)
@@ -267,6 +300,13 @@ STEPS: dict[str, Step] = {
             lambda run, settings: f"clone: behaviour cloning, the baseline, {run.wanted.clone_steps:,} steps",
         ),
         Step(
+            "examine",
+            ("data", "skill", "relabel", "policy", "clone"),
+            lambda run: "examine: what each stage is worth",
+            lambda run: {"seed": run.wanted.seed, "noise_scale": run.wanted.noise_scale},
+            _examine,
+        ),
+        Step(
             "evaluate",
             ("skill", "policy", "clone"),
             lambda run: f"evaluate: {run.episodes} episodes each, in the real environment",
@@ -275,7 +315,7 @@ STEPS: dict[str, Step] = {
         ),
         Step(
             "report",
-            ("relabel", "skill", "policy", "evaluate"),
+            ("relabel", "skill", "policy", "examine", "evaluate"),
             lambda run: "report: table, figures, clip",
             lambda run: {"task": run.task.name},
             _write_report,

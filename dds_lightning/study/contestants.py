@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from dds_lightning.agent import DDSAgent
 
 WAYS = ("greedy", "sample", "argmax_q", "random")
+DATA_POLICY = "the data's choice of skills (alpha 0)"
 COOL = 0.5
 """Temperature of the row between greedy and sampled."""
 
@@ -62,6 +63,7 @@ def final_contestants(
     clone: Any = None,
     controller: Any = None,
     best: Sequence[Contestant] = (),
+    data_policy: "DDSAgent | None" = None,
 ) -> list[Contestant]:
     """Return all contestants of the table at the end of `dds run`.
 
@@ -73,6 +75,7 @@ def final_contestants(
         clone: Actor of the behaviour-cloning baseline, if there is one.
         controller: Actor that collected the data, if there is one.
         best: The best checkpoint's contestants, if one was kept.
+        data_policy: The agent with alpha 0, which shows what choosing by the critic is worth.
     """
     ways = [
         (agent.selection, agent.temperature),
@@ -82,6 +85,8 @@ def final_contestants(
         ("argmax_q", 1.0),
     ]
     table = {way_name(*choice): way(agent, choice[0], episodes, choice[1]) for choice in [*ways, ("random", 1.0)]}
+    if data_policy is not None:
+        table[DATA_POLICY] = Contestant(DATA_POLICY, data_policy, episodes)
     contestants = [*table.values(), *best, single_skills(agent, episodes_per_skill)]
     if clone is not None:
         contestants.append(Contestant("behaviour cloning", clone, episodes))

@@ -16,12 +16,24 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
+from dds_lightning.study.contestants import DATA_POLICY
 from dds_lightning.study.tables import BEST
 from dds_lightning.tasks import Task
 
 if TYPE_CHECKING:
     from datamodules.trajectories import Trajectories
     from dds_lightning.study.findings import Findings
+
+
+_EVIDENCE = (
+    ("codes_used", "codes in use (training segments)", ".0f", 1.0),
+    ("expected_fall", "fall of held-out loss with a quarter more skill steps, %", ".1f", 100.0),
+    ("fidelity", "error of replayed skills, in distances between two segments", ".3f", 1.0),
+    ("fidelity_clone", "the same for behaviour cloning", ".3f", 1.0),
+    ("critic_rank", "rank correlation of V with returns of held-out episodes", ".2f", 1.0),
+    ("policy_shift", "way of the policy from the data's to the critic's best code, %", ".0f", 100.0),
+)
+"""Numbers of `evidence` in the report: key, what it is called, format, factor."""
 
 
 def behaviour_scores(trajectories: Trajectories, task: Task) -> dict[str, float]:
@@ -60,10 +72,8 @@ def _scores(findings: Findings) -> pd.DataFrame:
     data = findings.facts("data").get("scores", {})
     rows = [(f"the data, {which} episode", data[which]) for which in ("mean", "best") if which in data]
     summary = findings.summary
-    chosen = summary["contestant"].isin(["behaviour cloning", "random skills", findings.main]) | (
-        summary["kind"] == BEST
-    )
-    ladder = {"behaviour cloning": 0, "random skills": 1, findings.main: 3}  # the best single skill between them
+    ladder = {"behaviour cloning": 0, "random skills": 1, DATA_POLICY: 3, findings.main: 4}  # the best skill is 2
+    chosen = summary["contestant"].isin(list(ladder)) | (summary["kind"] == BEST)
     played = sorted(
         summary.loc[chosen, ["contestant", "score"]].itertuples(index=False),
         key=lambda row: ladder.get(str(row.contestant), 2),
@@ -85,6 +95,10 @@ def _measures(findings: Findings, logs: Mapping[str, Path]) -> pd.DataFrame:
     logged("skill", "val/codes_used", f"codes in use ({held_out})", ".0f")
     logged("policy", "val/clipped_share", "AWR weights that are clipped, %", ".1f", 100.0)
     logged("policy", "val/code_accuracy", "agreement of the policy with the data's codes, %", ".0f", 100.0)
+    evidence = findings.facts("examine")
+    for key, name, form, factor in _EVIDENCE:
+        if key in evidence:
+            rows.append((name, format(factor * float(evidence[key]), form)))
     start = findings.facts("evaluate").get("start_value")
     if start:
         bounds = [start["low"], start["high"]]

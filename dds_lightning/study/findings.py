@@ -12,11 +12,13 @@ import pandas as pd
 from dds_lightning.errors import UserError
 from dds_lightning.rollout.result import RolloutResult
 from dds_lightning.saving.run_directory import read_marker
+from dds_lightning.study.contestants import DATA_POLICY
 from dds_lightning.study.run_task import recall_task
-from dds_lightning.study.tables import failures_table, skills_table, summary_table
+from dds_lightning.study.tables import BEST, failures_table, skills_table, summary_table
+from dds_lightning.study.verdict import Verdict, verdict
 from dds_lightning.tasks import Task, known_task
 
-STAGES = ("data", "skill", "relabel", "policy", "clone", "evaluate")
+STAGES = ("data", "skill", "relabel", "policy", "clone", "examine", "evaluate")
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +89,21 @@ class Findings:
     def facts(self, stage: str) -> Mapping[str, Any]:
         """Return the facts in a stage's marker; empty if there is none."""
         return self.markers.get(stage, {}).get("facts", {})
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """The weak stage; None for a run of an older version, which did not examine its stages."""
+        evidence = self.facts("examine")
+        if not evidence:
+            return None
+        scores = {"agent": float(self.summary["score"].iloc[0])}
+        scores |= {f"data_{which}": value for which, value in self.facts("data").get("scores", {}).items()}
+        names = {"behaviour cloning": "clone", DATA_POLICY: "data_policy"}
+        for row in self.summary.itertuples(index=False):
+            name = "single" if row.kind == BEST else names.get(str(row.contestant))
+            if name is not None:
+                scores[name] = float(row.score)
+        return verdict(scores, evidence)
 
     @property
     def protocol(self) -> Mapping[str, Any] | None:

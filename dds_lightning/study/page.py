@@ -60,6 +60,8 @@ def _opening(findings: Findings) -> str:
         text += f" from cell {task.start_cell} to cell {task.goal_cell}"
     lines = [text + "."]
     lines += [f"{heading(findings.protocol)}."] if findings.protocol else []
+    if findings.verdict is not None:
+        lines.insert(1, f"**{findings.verdict.text}**")
     return "\n\n".join([*lines, *filter(None, [paper_line(task)])])
 
 

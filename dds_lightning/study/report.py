@@ -43,7 +43,8 @@ def write_report(run_dir: str | Path) -> dict[str, Any]:
 
     Returns:
         Paths of the files by name, and the facts that `summary_lines` prints, as plain JSON values: `task`, `main` (the
-        contestant that the run is about), `protocol` (see `protocol.protocol`; None for an older run), `table`
+        contestant that the run is about), `protocol` (see `protocol.protocol`; None for an older run), `verdict`
+        (`stage` and `text`, see `verdict.verdict`; None for an older run), `table`
         (see `tables.summary_table`), `failures` (of the main contestant; see `tables.failures_table`) and
         `diagnosis` (see `diagnosis.diagnose`).
 
@@ -74,6 +75,7 @@ def write_report(run_dir: str | Path) -> dict[str, Any]:
         "task": findings.task.name,
         "main": findings.main,
         "protocol": findings.protocol,
+        "verdict": findings.verdict and findings.verdict._asdict(),
         "table": findings.summary.round(4),
         "failures": failures.round(4).astype(object).where(failures.notna(), None),
         "diagnosis": {name: table.round(4) for name, table in diagnosis.items()},
@@ -105,6 +107,8 @@ def summary_lines(facts: Mapping[str, Any]) -> list[RenderableType]:
     text: list[RenderableType] = [heading(protocol) if protocol else facts["task"], table(summary)]
     if line := paper_line(task):
         text.append(line)
+    if weak := facts.get("verdict"):
+        text.append(weak["text"])
     failures = pd.DataFrame(facts["failures"])
     if not task.measures_success:
         return text

@@ -76,6 +76,18 @@ def test_the_curve_survives_a_checkpoint_of_plain_values():
     assert second.history == first.history
 
 
+def test_a_training_that_ended_early_says_what_more_steps_would_bring():
+    callback = Convergence()
+    assert callback.remark() is None  # nothing is known
+    callback.history = curve(0.3)
+    assert callback.remark() == (
+        "val/loss would fall by another 6 % with a quarter more steps; if the agent disappoints, raise "
+        "--trainer.max_steps"
+    )
+    callback.history = curve(1.0, floor=1.0)
+    assert callback.remark() is None  # it has levelled off
+
+
 def test_a_metric_that_nobody_logs_is_named_beside_those_that_are():
     trainer = SimpleNamespace(should_stop=False, sanity_checking=False, state=SimpleNamespace(fn="fit"))
     trainer.global_step, trainer.callback_metrics = 10, {"val/loss": torch.tensor(1.0), "train/loss": torch.tensor(1.0)}

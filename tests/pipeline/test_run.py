@@ -26,7 +26,7 @@ from dds_lightning.study.contestants import final_contestants, way_name
 from dds_lightning.tasks import get_task
 
 TASK = "pointmaze-umaze-diverse"
-STAGES = ["data", "skill", "relabel", "policy", "clone", "evaluate", "report"]
+STAGES = ["data", "skill", "relabel", "policy", "clone", "examine", "evaluate", "report"]
 SMALL = ["--data_steps=2000", "--clone_steps=20", "--episodes=2", "--episodes_per_skill=1", "--workers=1"]
 SMALL += ["--skill.trainer.max_steps=20", "--skill.data.validation_fraction=0.2", "--skill.data.batch_size=32"]
 SMALL += ["--skill.model.num_skills", "4", "--skill.model.hidden_dim=16", "--skill.model.skill_dim=8"]
@@ -64,10 +64,14 @@ def test_every_stage_leaves_a_marker_and_its_files(finished):
         "AWR policy, sampled at temperature 0.5": 2,
         "argmax-Q": 2,
         "random skills": 2,
+        "the data's choice of skills (alpha 0)": 2,
         "single skill": 4,
         "behaviour cloning": 2,
         "the data's controller": 2,
     }
+    evidence = set(markers["examine"]["facts"])
+    assert evidence >= {"terminates", "codes_used", "fidelity", "fidelity_clone", "critic_rank", "policy_shift"}
+    assert json.loads((finished / "report" / "stage.json").read_text())["facts"]["verdict"]["text"]
     assert (finished / "report" / "report.md").is_file()
 
 

@@ -1,0 +1,124 @@
+"""What a run's stages are worth one by one: the numbers from which `verdict` names the weak one.
+
+```
+ data ──► how many episodes end early and no termination says why
+ skills ─► codes in use, fidelity in the simulator, how much held-out loss was still falling
+ critic ─► rank correlation of V with the returns of held-out episodes
+ policy ─► how far it has moved from the policy of the data
+```
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from dds_lightning.errors import UserError
+
+if TYPE_CHECKING:
+    from datamodules.relabelled import RelabeledDataModule
+    from datamodules.trajectories import Trajectories
+    from dds_lightning.baselines.behaviour_cloning import BehaviourCloning
+    from dds_lightning.policy import PolicyModule
+    from dds_lightning.tasks import Task
+
+EARLY = 0.9
+"""An episode shorter than this share of the task's longest ends early."""
+STATES = 5000
+"""Most states at which critic and policy are asked."""
+
+
+def data_evidence(trajectories: Trajectories, task: Task) -> dict[str, Any]:
+    """Return shares of episodes: `ends_early`, before the task's limit, and `terminates`, by a termination."""
+    ended = trajectories.terminations[trajectories.step_offsets[1:] - 1]
+    return {
+        "ends_early": float((trajectories.lengths < EARLY * task.max_episode_steps).mean()),
+        "terminates": float(ended.mean()),
+    }
+
+
+def skill_evidence(checkpoint: Path) -> dict[str, Any]:
+    """Return what a skill checkpoint says of its training.
+
+    Returns:
+        `codes_used` (codes with at least a tenth of the share 1/K, by the running usage), `num_skills`, and, where its
+        validations allow it, `expected_fall`: by which share a quarter more steps would lower held-out loss.
+    """
+    from dds_lightning.callbacks.best import callback_state
+    from dds_lightning.callbacks.convergence import Convergence, expected_fall
+    from dds_lightning.saving.checkpoint import load_ckpt
+    from dds_lightning.skill import SkillModule
+
+    skill = SkillModule.load(checkpoint)
+    found: dict[str, Any] = {"num_skills": skill.num_skills}
+    if skill.discrete:
+        found["codes_used"] = int(skill.bottleneck.health()["codes_used"])
+    kept = callback_state(load_ckpt(checkpoint), Convergence) if checkpoint.suffix == ".ckpt" else None
+    fall = expected_fall([(int(step), float(loss)) for step, loss in kept["history"]]) if kept else float("nan")
+    return found if np.isnan(fall) else {**found, "expected_fall": fall}
+
+
+def fidelity_evidence(
+    trajectories: Trajectories, skill: Any, clone: BehaviourCloning, noise_scale: float | None, seed: int
+) -> dict[str, float]:
+    """Return `fidelity` and `fidelity_clone`, errors of replays (see `interpret.measure.fidelity`); {} without them."""
+    from dds_lightning.interpret.measure.fidelity import SKILLS, fidelity
+
+    @torch.inference_mode()
+    def act(observations: Any, rows: Any) -> Any:
+        return clone(torch.from_numpy(observations).to(clone.device)).float().cpu().numpy()
+
+    assert trajectories.task is not None, "a run has a task"
+    try:
+        table = fidelity(trajectories.task, trajectories, skill, {"clone": act}, noise_scale=noise_scale, seed=seed)
+    except UserError:  # not MuJoCo, or observations that do not hold its state
+        return {}
+    errors = table.set_index("player")["error"]
+    return {"fidelity": float(errors[SKILLS]), "fidelity_clone": float(errors["clone"])}
+
+
+@torch.inference_mode()
+def policy_evidence(data: RelabeledDataModule, policy: PolicyModule) -> dict[str, float]:
+    """Ask critic and policy at the states of held-out episodes, or of all where none are held out.
+
+    Args:
+        data: The transitions, set up.
+        policy: The trained module.
+
+    Returns:
+        `critic_rank`: Spearman's correlation of V with the discounted return to the episode's end; and with
+        ``awr: closed_form`` `policy_shift`: KL(pi || beta) as a share of the most that any choice among the codes of
+        the data gives, 0 for the policy of the data, 1 for always the critic's best code.
+    """
+    from scipy.stats import spearmanr
+
+    from datamodules.relabelling import returns_to_go
+
+    assert data.transitions is not None, "setup() comes first"
+    index = data.validation_index if len(data.validation_index) else torch.arange(len(data.transitions))
+    index = index[:STATES]
+    relabelling = data.relabelling.for_task(data.task)
+    rewards = relabelling.learning_rewards(data.trajectories, data.horizon)
+    returns = returns_to_go(rewards, data.trajectories.lengths, relabelling.step_discount(data.horizon))
+    states = data.transitions.observations[index]
+    values = policy.v(states.to(policy.device)).cpu().numpy()
+    rank = float(spearmanr(values, returns[data.transitions.starts[index].numpy()]).statistic)
+    found = {"critic_rank": 0.0 if np.isnan(rank) else rank}
+    if policy.hparams.awr == "closed_form":
+        found["policy_shift"] = policy_shift(policy, states)
+    return found
+
+
+@torch.inference_mode()
+def policy_shift(policy: PolicyModule, observations: torch.Tensor) -> float:
+    """KL(pi || beta) over states (N, O), as a share of the KL of always taking the likeliest code of pi."""
+    observations = observations.to(policy.device)
+    log_pi = policy.logits(observations).log_softmax(dim=-1)
+    allowed = log_pi.isfinite()
+    beta = policy.actor(policy.embed(observations)).masked_fill(~allowed, -torch.inf).log_softmax(dim=-1)
+    moved = torch.where(allowed, log_pi.exp() * (log_pi - beta), 0.0).sum(dim=-1).mean()
+    most = -beta.gather(1, log_pi.argmax(dim=-1, keepdim=True)).mean()
+    return float(moved / most.clamp_min(1e-6))

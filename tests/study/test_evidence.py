@@ -1,0 +1,72 @@
+"""Evidence about stages: shares of episodes, ranks of values, and how far a policy has moved."""
+
+import numpy as np
+import pytest
+import torch
+
+from datamodules.relabelled import RelabeledDataModule
+from datamodules.trajectories import Trajectories
+from dds_lightning.policy import PolicyModule
+from dds_lightning.skill import SkillModule
+from dds_lightning.study.evidence import data_evidence, policy_evidence, policy_shift
+from dds_lightning.tasks import get_task
+
+SMALL = {"hidden_dim": 16, "encoder_layers": 1, "encoder_heads": 2, "decoder_blocks": 1, "skill_dim": 8}
+
+
+def walks(lengths, terminated) -> Trajectories:
+    """Episodes along one axis; every step pays its position."""
+    episodes = []
+    for steps, fell in zip(lengths, terminated, strict=True):
+        last = np.arange(steps) == steps - 1
+        place = np.linspace(0.0, 1.0, steps + 1, dtype=np.float32)
+        episodes.append(
+            {
+                "observations": np.stack([place, np.ones_like(place)], axis=1),
+                "actions": np.zeros((steps, 1), np.float32),
+                "rewards": place[1:],
+                "terminations": last & fell,
+                "truncations": last & (not fell),
+            }
+        )
+    return Trajectories.from_episodes("walks", episodes)
+
+
+def test_episodes_that_end_early_and_those_that_say_why():
+    task = get_task("hopper-medium")  # at most 1000 steps
+    assert data_evidence(walks([1000, 100, 50, 899], [False, True, False, False]), task) == {
+        "ends_early": 0.75,
+        "terminates": 0.25,
+    }
+
+
+def test_the_critic_is_ranked_by_returns_to_go(tmp_path):
+    torch.manual_seed(0)
+    skill = SkillModule(2, 1, horizon=3, num_skills=4, **SMALL)
+    path = tmp_path / "skill.ckpt"
+    torch.save({"state_dict": skill.state_dict(), "hyper_parameters": dict(skill.hparams)}, path)
+    data = RelabeledDataModule.from_trajectories(
+        walks([40, 40], [False, False]), str(path), gamma=0.5, discount="per_step", validation_fraction=0.0
+    )
+    data.prepare_data()
+    data.setup()
+    policy = PolicyModule(2, 4, hidden_dims=[8], awr="regression")
+    policy.v = lambda observations: observations[:, 0]  # returns to go rise along the way, but for the last steps
+    assert policy_evidence(data, policy) == {"critic_rank": pytest.approx(1.0, abs=0.05)}
+    policy.v = lambda observations: -observations[:, 0]
+    assert policy_evidence(data, policy)["critic_rank"] == pytest.approx(-1.0, abs=0.05)
+    policy.v = lambda observations: torch.zeros(len(observations))
+    assert policy_evidence(data, policy)["critic_rank"] == 0.0
+
+
+def test_the_shift_runs_from_the_datas_policy_to_the_critics_best_code():
+    torch.manual_seed(0)
+    policy = PolicyModule(2, 4, hidden_dims=[16], awr="closed_form", alpha=0.0)
+    states = torch.randn(200, 2)
+    shifts = []
+    for alpha in (0.0, 1.0, 10.0, 1e4):
+        policy.hparams.alpha = alpha
+        shifts.append(policy_shift(policy, states))
+    assert shifts[0] == pytest.approx(0.0, abs=1e-6)
+    assert shifts == sorted(shifts)
+    assert shifts[-1] == pytest.approx(1.0, abs=0.02)
