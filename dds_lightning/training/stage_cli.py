@@ -7,16 +7,18 @@
 - A mistake in the data is found before the first file is written.
 """
 
+import math
 import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import lightning.pytorch as pl
 import torch
 import yaml
 from jsonargparse import ArgumentError, Namespace
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from rich.console import Console
 
 from dds_lightning.callbacks.average import AverageWeights
 from dds_lightning.callbacks.best import BestCheckpoint
@@ -30,6 +32,7 @@ from dds_lightning.saving.checkpoint import load_ckpt, stage_of
 from dds_lightning.saving.files import short
 from dds_lightning.tasks.own import is_address
 from dds_lightning.training.fit import advice_on_memory, fit, quieten
+from dds_lightning.training.precision import fastest_precision
 from dds_lightning.training.stages import get_stage
 from dds_lightning.training.trainer import TrainingSettings, trainer_settings
 
@@ -51,6 +54,7 @@ class StageCLI(LightningCLI):
         self.parse_only = parse_only
         self.arguments = resolve_configs(arguments)
         self.checkpoint: dict[str, Any] | None = None
+        self.measured_precision: str | None = None
         parser = {"exit_on_error": False}
         super().__init__(
             self.stage.module_class(),
@@ -81,6 +85,12 @@ class StageCLI(LightningCLI):
         parser.add_lightning_class_args(BestCheckpoint, "best")
         parser.add_lightning_class_args(AverageWeights, "average")
         parser.add_lightning_class_args(Convergence, "stop")
+        parser.add_argument(
+            "--precision",
+            type=Literal["auto"] | None,
+            default=None,
+            help="auto: measure whether bfloat16 is faster here; --trainer.precision overrules it",
+        )
         parser.add_argument("--json", action="store_true", help="print one JSON document and nothing else")
         for name in self.stage.links:
             parser.link_arguments(f"data.{name}", f"model.{name}", apply_on="instantiate")
@@ -184,6 +194,7 @@ class StageCLI(LightningCLI):
         Raises:
             UserError: They do not fit each other, or the checkpoint.
         """
+        self._choose_precision()
         super()._set_seed()
         super().instantiate_classes()
         trained = (self.checkpoint or {}).get("hyper_parameters", {})
@@ -203,6 +214,17 @@ class StageCLI(LightningCLI):
             )
         return self
 
+    def _choose_precision(self) -> None:
+        """Settle `precision: auto`, unless the user or the checkpoint that goes on has."""
+        settings = self.settings
+        if settings.get("precision") != "auto" or settings.trainer.precision is not None:
+            return
+        use_gpu = torch.cuda.is_available() and settings.trainer.accelerator in ("auto", "gpu", "cuda")
+        choice = fastest_precision(use_gpu)
+        settings.trainer.precision = self.measured_precision = choice.precision
+        why = "" if math.isnan(choice.speedup) else f" (bfloat16 is {choice.speedup:.1f} times as fast as float32 here)"
+        Console(stderr=True).print(f"precision: {choice.precision}{why}", style="dim", highlight=False)
+
     def _instantiate_trainer(self, config: dict[str, Any], callbacks: list[pl.Callback]) -> pl.Trainer:
         callbacks = [*callbacks, TrainingSettings(self._settings_to_keep())]
         return super()._instantiate_trainer(trainer_settings(dict(config), callbacks), [])
@@ -210,7 +232,8 @@ class StageCLI(LightningCLI):
     def _settings_to_keep(self) -> dict[str, Any]:
         """Seed and settings of the data: with the model's own, what a training cannot change on its way."""
         data = {f"data.{name}": value for name, value in self.settings.data.as_dict().items() if name not in PLACES}
-        return {"seed_everything": self.settings.seed_everything, **data}
+        chosen = {"trainer.precision": self.measured_precision} if self.measured_precision else {}
+        return {"seed_everything": self.settings.seed_everything, **data, **chosen}
 
     # ---------------------------------------------------------------- working
 
