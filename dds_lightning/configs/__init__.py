@@ -13,7 +13,7 @@ RUN_DEFAULTS: dict[str, Any] = {
     "data_steps": 200_000,
     "clone_steps": 16_000,
     "selection": "sample",
-    "temperature": 1.0,
+    "temperature": 0.5,  # improbable codes stay out, and an unlucky choice is not repeated for ever
     "noise_scale": None,  # the skill model's
 }
 """What a preset's `run.yaml` may set, with the defaults."""
