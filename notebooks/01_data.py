@@ -37,6 +37,7 @@ from dds_lightning import get_task
 from dds_lightning.interpret.draw.drawing import draw_starts, draw_trail, draw_walls
 from dds_lightning.interpret.draw.gif import CachedBackground, gif_bytes
 from dds_lightning.interpret.draw.palette import WALL
+from dds_lightning.interpret.draw.strobe import draw_objects
 from dds_lightning.interpret.measure.body import body_frames
 from dds_lightning.interpret.measure.replay import simulator
 from dds_lightning.interpret.measure.states import body_states
@@ -131,10 +132,7 @@ for t, colour in ((0, "#f0b7b2"), (len(fall) - 1, "#d0271a")):
     draw_limbs(middle, fall, t, (0, 2), color=colour, linewidth=7)
 middle.set(xlim=(-0.8, 0.8), ylim=(-0.1, 1.5), aspect="equal", xlabel="x (m)", ylabel="z (m)")
 draw_limbs(right, arm, 0, (0, 2), color="#10a06f", linewidth=6)
-for (x, _, z), name in zip(arm.objects[0], arm.names, strict=True):
-    if not name.startswith(("burner", "knob")):
-        right.plot(x, z, "s", color=WALL, markeredgecolor="black")
-        right.annotate(name, (x, z), (0, 6), textcoords="offset points", ha="center", fontsize=8)
+draw_objects(right, arm.objects[0][:, [0, 2]], arm.names)
 right.set(aspect="equal", xlabel="x (m)", ylabel="z (m)")
 right.margins(x=0.35, y=0.15)
 titles = ("AntMaze, from above", f"Hopper, from the side, {len(fall) - 1} steps", "Kitchen, from behind the arm")

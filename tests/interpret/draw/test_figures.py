@@ -1,6 +1,7 @@
 """Figures hold what the tables say: walls, paths, codes, ends."""
 
 import io
+from itertools import pairwise
 
 import imageio.v3 as imageio
 import numpy as np
@@ -260,7 +261,7 @@ def test_curves_count_codes_in_whole_numbers_and_no_title_meets_another(tmp_path
     assert all(tick == round(tick) for axis in (codes.get_yticks(), codes.get_xticks()) for tick in axis)
     for row in (figure.axes[:4], figure.axes[4:]):
         boxes = [ax.title.get_window_extent() for ax in row]
-        assert all(left.x1 < right.x0 for left, right in zip(boxes, boxes[1:], strict=False))
+        assert all(left.x1 < right.x0 for left, right in pairwise(boxes))
         assert boxes[-1].x1 < figure.bbox.x1
 
 
