@@ -73,7 +73,7 @@ print(f"{data.num_steps:,} steps in {data.num_episodes} episodes: {reached.sum()
 # ## Cut and name
 #
 # The encoder of notebook 02 maps a segment $\tau$ of ten states and actions to a point, and the nearest vector of the
-# codebook gives the segment its code (equation 10): $k = \arg\min_j \lVert E(\tau) - z_j \rVert$. Here is the longest
+# codebook gives the segment its code (equation 11): $k = \arg\min_j \lVert E(\tau) - z_j \rVert$. Here is the longest
 # drive that enters the goal, first as a sequence of steps, then, segment by segment, as a sequence of skills.
 
 # %%
@@ -230,8 +230,9 @@ figure
 # ## How long they last, and how they end
 #
 # Nearly all segments have ten steps. The few shorter ones end in the goal: a drive that enters it yields one segment
-# each of 1, 2, ... 9 and 10 steps that contains the arrival (on the right: where they begin). They are fewer than one
-# in a hundred, and they are the *only* rows that say that anything good ever happens.
+# each of 1, 2, ... 9 and 10 steps that contains the arrival (on the right: where they begin). One of the 23 drives has
+# only five steps in all, so 225 rows enter the goal and not 230. They are fewer than one in a hundred, and they are the
+# *only* rows that say that anything good ever happens.
 
 # %%
 figure = Figure(figsize=(9.5, 3.0), layout="constrained")

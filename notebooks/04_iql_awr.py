@@ -39,7 +39,7 @@ from dds_lightning.interpret.draw.clip import write_clip
 from dds_lightning.interpret.draw.drawing import draw_walls
 from dds_lightning.interpret.draw.maze import plot_failures, plot_value_map
 from dds_lightning.interpret.draw.palette import skill_colour
-from dds_lightning.interpret.draw.values import plot_policy_map
+from dds_lightning.interpret.draw.values import plot_policy_map, value_and_codes
 from dds_lightning.rollout import Contestant, rollout
 from dds_lightning.study.skill_replays import replay_skills
 
@@ -118,8 +118,9 @@ figure
 # The value map is redrawn while critic and policy learn. At first every place looks the same. Then all values sink,
 # because every skill costs about 1, but near the goal they soon stop, and skill by skill the difference spreads
 # backwards: $Q(s, k)$ learns from $R + \gamma V(s')$ (equation 8), $V$ from $Q$. It has to spread *around* walls, which
-# is hard for a smooth network; that is what the Fourier features are for. Each colour covers the same area. The numbers
-# are the likeliest skill for a body at rest, the arrows show where that skill leads such a body on average.
+# is hard for a smooth network; that is what the Fourier features are for. Each colour covers the same area. No reward
+# is above 0, so what the network believes above 0, right at the goal, is drawn as 0. The numbers are the likeliest
+# skill for a body at rest, the arrows show where that skill leads such a body on average.
 
 # %%
 replays = replay_skills(task, agent, steps=20)  # every skill from eight places, as in notebook 02
@@ -127,18 +128,8 @@ ways = [p[a.sum()] - p[0] for p, a in zip(replays["positions"], replays["alive"]
 directions = pd.DataFrame(ways).groupby(replays["codes"]).mean().to_numpy()  # (K, 2) metres
 
 
-def value_of(policy: PolicyModule):
-    """V as the figures want it: arrays in, arrays out."""
-    return lambda observations: policy.v(torch.from_numpy(observations)).detach().numpy()
-
-
-def likeliest(policy: PolicyModule):
-    return lambda observations: policy.codes(torch.from_numpy(observations), "greedy").numpy()
-
-
 def draw(policy: PolicyModule, step: int) -> Figure:
-    with torch.no_grad():
-        figure = plot_value_map(task, value_of(policy), likeliest(policy), directions)
+    figure = plot_value_map(task, *value_and_codes(policy), directions)
     figure.suptitle(f"after {step:,} steps")
     return figure
 
@@ -158,8 +149,7 @@ class Watch(pl.Callback):
         step = trainer.global_step
         if step % self.every and step not in (1, trainer.max_steps):
             return
-        with torch.no_grad():
-            self.maps[step] = value_of(module)(centres)
+        self.maps[step] = value_and_codes(module)[0](centres)
         picture = draw(module, step)
         if self.handle is None:
             self.handle = display(picture, display_id=True)

@@ -146,7 +146,7 @@ plot_stitching(maze, result, "AWR policy")
 # ## Can a skill be recognised from what it does?
 #
 # "Skill 10 goes right" is a claim, and the encoder can judge it. Hold $k$ for ten steps, give the result to the
-# encoder, and see which code it assigns (equation 10):
+# encoder, and see which code it assigns (equation 11):
 #
 # $$\hat k = \arg\min_j \lVert E(\tau_k) - z_j \rVert$$
 #

@@ -653,9 +653,10 @@ checks.round(2)
 # Stage by stage, with your arrays in a folder; no task is named, so widths come from the data:
 #
 # ```bash
-# dds data check runs/cart-data --horizon 10
-# dds skill fit --config pointmaze/skill.yaml --data.data arrays:runs/cart-data --checkpoint.dirpath runs/cart-skill
-# dds policy fit --config pointmaze/policy.yaml --data.data arrays:runs/cart-data \
+# dds data check runs/notebooks/08/cart-data --horizon 10
+# dds skill fit --config pointmaze/skill.yaml --data.data arrays:runs/notebooks/08/cart-data \
+#     --checkpoint.dirpath runs/cart-skill
+# dds policy fit --config pointmaze/policy.yaml --data.data arrays:runs/notebooks/08/cart-data \
 #     --data.skill runs/cart-skill/last.ckpt --data.reward_scale 0.1 --data.reward_shift=-1 \
 #     --model.fourier_seen 2 --checkpoint.dirpath runs/cart-policy
 # dds publish - shared/cart --skill runs/cart-skill/last.ckpt --policy runs/cart-policy/last.ckpt

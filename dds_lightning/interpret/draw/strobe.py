@@ -173,7 +173,9 @@ def draw_objects(ax: Axes, places: Floats, names: Sequence[str]) -> None:
         members = places[[one == kind for one in kinds]]
         ax.plot(*members.T, "s", color=WALL, markeredgecolor=NO_SKILL, markersize=4, zorder=1)
         above = (float(members[:, 0].mean()), float(members[:, 1].max()))
-        ax.annotate(kind, above, (0, 5), textcoords="offset points", ha="center", fontsize=7, color=NO_SKILL)
+        # To the left of a single one, whose neighbour may be close; above the middle of several.
+        shift, side = (4, "right") if len(members) == 1 else (0, "center")
+        ax.annotate(kind, above, (shift, 5), textcoords="offset points", ha=side, fontsize=7, color=NO_SKILL)
 
 
 def _draw_body(ax: Axes, view: View, body: BodyFrames, t: int, colour: Any) -> None:
