@@ -325,6 +325,17 @@ checks.round(2)
 # 3. Bring your own: write two episodes as plain arrays and give them to `Trajectories.from_episodes`. Leave out
 #    `terminations`; what does the error say?
 #
+# <details>
+# <summary>Answers</summary>
+#
+# 1. The squares along the walls: 139 of them are visited instead of 190. Segments that start at less than 0.2 m/s
+#    become rare, 0.2 % instead of 3.3 %, so a learner would know next to nothing about a ball at rest.
+# 2. Five episodes reach our goal; with the diverse drives it is six. Neither steers to it deliberately.
+# 3. "'terminations' is missing; expected observations, actions, rewards, terminations, truncations, found ...". Nothing
+#    is guessed, because the arrays alone cannot say whether an end was an arrival or merely the end of the recording.
+#
+# </details>
+#
 # ## The same at full size
 #
 # ```bash

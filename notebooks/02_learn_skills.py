@@ -310,6 +310,19 @@ checks.round(2)
 #    same state? Compare the two on segments that begin at a junction.
 # 3. Bring back only one of the two measures (`codebook_init="kmeans"`, or `restart_threshold=0.1`). Which does more?
 #
+# <details>
+# <summary>Answers</summary>
+#
+# 1. With 4, 8 and 16 skills: perplexity 3.5, 7.1 and 13.8, error of the actions 0.45, 0.40 and 0.37. Four pushes take a
+#    ball anywhere, but more of them copy the data more closely: finer directions, and corrections.
+# 2. The MLP draws the same action every time; two draws of the diffusion decoder differ by 0.24 on average. The MLP's
+#    error is smaller (0.33 against 0.40), because a mean is the best single guess. Where drives part, though, the mean
+#    of left and right is a way that nobody took.
+# 3. With this seed each is enough by itself: all eight codes stay in use, at perplexity 7.3 with k-means alone and 6.9
+#    with restarts alone, against 4 codes and 3.3 with neither.
+#
+# </details>
+#
 # ## The same at full size
 #
 # ```bash

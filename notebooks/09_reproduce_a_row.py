@@ -356,6 +356,20 @@ checks.round(1)
 # 2. `DATA_STEPS = 400_000` with the same training: does the score follow the data or the training?
 # 3. Choose `hopper-medium`: there is no expert in the data. How much of the advantage over behaviour cloning is left?
 #
+# <details>
+# <summary>Answers</summary>
+#
+# 1. A recipe this small is close to failing, so expect tens of points: see the two trials above. And no, it is not the
+#    same: the ± in the table is the standard error over episodes of *one* agent; the deviation over seeds also contains
+#    what a training makes of its luck, and it is usually larger.
+# 2. Look at the diagnosis, not only at the score. 4,000 steps of 64 segments are 3.2 passes over 80,000 steps, but only
+#    0.64 over 400,000: if error of decoded actions and agreement with the data do not improve, the training was the
+#    bottleneck, and more data alone cannot help.
+# 3. Expect little. Where the data hold one gait there is no better half to choose: `argmax` and imitation meet, and
+#    what remains is a preference for the better moments of the same gait.
+#
+# </details>
+#
 # ## The same at full size
 #
 # With our data (the exact command of the shipped agent, which is older than the preset, is on its card):
