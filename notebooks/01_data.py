@@ -120,8 +120,8 @@ def draw_limbs(ax, body, t, axes, **line) -> None:
     ax.add_collection(LineCollection(list(body.limbs[t][:, :, axes]), capstyle="round", **line))
 
 
-figure = Figure(figsize=(9.5, 3.6), layout="constrained")
-left, middle, right = figure.subplots(1, 3)
+figure = Figure(figsize=(9.5, 3.3), layout="constrained")
+left, middle, right = figure.subplots(1, 3, width_ratios=(1.0, 0.8, 1.4))
 draw_walls(left, ant_task)
 left.plot(*ant.root[:101, :2].T, color="black", linewidth=0.8, zorder=2)
 for t in range(0, min(len(ant), 101), 20):
@@ -134,8 +134,8 @@ middle.set(xlim=(-0.8, 0.8), ylim=(-0.1, 1.5), aspect="equal", xlabel="x (m)", y
 draw_limbs(right, arm, 0, (0, 2), color="#10a06f", linewidth=6)
 draw_objects(right, arm.objects[0][:, [0, 2]], arm.names)
 right.set(aspect="equal", xlabel="x (m)", ylabel="z (m)")
-right.margins(x=0.35, y=0.15)
-titles = ("AntMaze, from above", f"Hopper, from the side, {len(fall) - 1} steps", "Kitchen, from behind the arm")
+right.margins(x=0.3, y=0.15)
+titles = ("AntMaze, from above", f"Hopper, {len(fall) - 1} steps", "Kitchen, from behind the arm")
 for ax, title in zip((left, middle, right), titles, strict=True):
     ax.set_title(title, fontsize=11)
 figure

@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from dds_lightning.errors import UserError
-from dds_lightning.interpret.draw.drawing import LABEL, TICKS, draw_walls, grid, heading
+from dds_lightning.interpret.draw.drawing import LABEL, TICKS, draw_walls, grid, heading, write_title
 from dds_lightning.interpret.draw.gif import CachedBackground, gif_bytes
 from dds_lightning.interpret.draw.palette import NO_SKILL, WALL, skill_colour
 from dds_lightning.interpret.measure.body import BodyFrames
@@ -86,7 +86,7 @@ def plot_strobes(
         ax.label_outer()
         ax.tick_params(labelbottom=True, labelleft=True)
     shown_title = title or f"Each skill from the same state, a body every {every * seconds:g} s"
-    figure.suptitle(shown_title, fontsize=LABEL - 1)
+    write_title(figure, shown_title, LABEL - 1)
     return figure
 
 

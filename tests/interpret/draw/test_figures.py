@@ -148,6 +148,20 @@ def test_every_skill_has_a_panel_with_every_start(replays):
     assert "from 3 starts, 10 steps" in figure.get_suptitle()
 
 
+@pytest.mark.parametrize("panels", [1, 2, 3])
+def test_no_title_is_wider_than_its_figure(replays, panels):
+    few = {name: values[:panels] for name, values in replays.items()}
+    by_code = {**few, "codes": np.arange(panels)}
+    for figure in (plot_skills_by_start(TASK, **few), plot_starts_by_skill(TASK, **by_code)):
+        figure.savefig(io.BytesIO())
+        title = figure._suptitle.get_window_extent()
+        assert figure.bbox.x0 <= title.x0 < title.x1 <= figure.bbox.x1
+        assert title.y0 > max(ax.get_window_extent().y1 for ax in figure.axes)
+    assert (
+        "from 1 start, 10 steps" in " ".join(plot_starts_by_skill(TASK, **by_code).get_suptitle().split()) or panels > 1
+    )
+
+
 def dots(ax) -> np.ndarray:
     (collection,) = [c for c in ax.collections if isinstance(c, PathCollection)]
     return collection.get_offsets()
