@@ -298,6 +298,21 @@ checks.round(2)
 # 3. `alpha=0` turns AWR into plain imitation of the data. Let it play. Then try `alpha=50`: which number in
 #    `policy.terms` shows that only a few rows are still being imitated?
 #
+# <details>
+# <summary>Answers</summary>
+#
+# 1. V becomes the mean over where the drives went, and they went anywhere: in the table of notebook 03 the same change
+#    turns V at the start from -33 to -83. A junction is then worth what the average drive makes of it, and an arrow
+#    points to what beats that average, which need not be the way.
+# 2. It leaks through thin walls, because a smooth network cannot represent them. At full size three seeds without these
+#    features reach the goal in 0, 0 and 0 % (README): nearly every episode ends pressed against the wall above cell (5,
+#    2), which is close to the goal as the crow flies.
+# 3. With `alpha=0` all weights are 1, so the agent drives as the data do: to anywhere. With `alpha=50` it is
+#    `effective_sample_size` that falls, the share of the rows that weights so unequal amount to, and `clipped_share`
+#    tells how many of them are at their upper bound.
+#
+# </details>
+#
 # ## The same at full size
 #
 # ```bash
