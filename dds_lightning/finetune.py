@@ -88,9 +88,11 @@ def start_from(module: StageModule, path: str) -> None:
     log.info("started from %s: %d of %d tensors", path, len(loaded), len(ours))
     if misfits:
         listed = "; ".join(f"{name} {_shapes(theirs.get(name), ours[name])}" for name in misfits)
+        others = [name for name in ours if name in left and name not in misfits]
+        data = f"; {len(others)} come from the new data: {', '.join(others)}" if others else ""
         warnings.warn(
-            f"model.init_from: {path} fits in {len(loaded)} of {len(ours)} tensors; these start anew (shape there, "
-            f"here): {listed}",
+            f"model.init_from: {path} fits in {len(loaded)} of {len(ours)} tensors{data}; {len(misfits)} start anew "
+            f"(shape there, here): {listed}",
             stacklevel=2,
         )
 

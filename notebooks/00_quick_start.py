@@ -151,6 +151,19 @@ checks.round(1)
 # 3. `agent.variant("fixed", fixed_codes=[3])` plays one skill for ever. How far does it get, and which skill gets
 #    farthest from the start?
 #
+# <details>
+# <summary>Answers</summary>
+#
+# 1. A little: both reach the goal in 20 of 20 episodes, greedy after 363 steps on average, sampled after 376. But a
+#    deterministic choice repeats itself as long as the state does: pressed against a wall it would press for ever, and
+#    chance leads away from there (notebook 04 shows an agent that lacks it).
+# 2. All 20 still arrive, after 376 steps on average. The decoder then gives the same force whenever state and skill are
+#    the same; what is left of chance is the choice of the skill.
+# 3. None reaches the goal. Skill 9, which does different things in different places, gets farthest: 4.9 m from the
+#    start as the crow flies. Eight others come 2.5 to 2.8 m far, three 1.5 m, and skills 6, 7, 14 and 15 only 0.6 m.
+#
+# </details>
+#
 # ## The same at full size
 #
 # ```bash

@@ -37,6 +37,7 @@ from dds_lightning import get_task
 from dds_lightning.interpret.draw.drawing import draw_starts, draw_trail, draw_walls
 from dds_lightning.interpret.draw.gif import CachedBackground, gif_bytes
 from dds_lightning.interpret.draw.palette import WALL
+from dds_lightning.interpret.draw.strobe import draw_objects
 from dds_lightning.interpret.measure.body import body_frames
 from dds_lightning.interpret.measure.replay import simulator
 from dds_lightning.interpret.measure.states import body_states
@@ -119,8 +120,8 @@ def draw_limbs(ax, body, t, axes, **line) -> None:
     ax.add_collection(LineCollection(list(body.limbs[t][:, :, axes]), capstyle="round", **line))
 
 
-figure = Figure(figsize=(9.5, 3.6), layout="constrained")
-left, middle, right = figure.subplots(1, 3)
+figure = Figure(figsize=(9.5, 3.3), layout="constrained")
+left, middle, right = figure.subplots(1, 3, width_ratios=(1.0, 0.8, 1.4))
 draw_walls(left, ant_task)
 left.plot(*ant.root[:101, :2].T, color="black", linewidth=0.8, zorder=2)
 for t in range(0, min(len(ant), 101), 20):
@@ -131,13 +132,10 @@ for t, colour in ((0, "#f0b7b2"), (len(fall) - 1, "#d0271a")):
     draw_limbs(middle, fall, t, (0, 2), color=colour, linewidth=7)
 middle.set(xlim=(-0.8, 0.8), ylim=(-0.1, 1.5), aspect="equal", xlabel="x (m)", ylabel="z (m)")
 draw_limbs(right, arm, 0, (0, 2), color="#10a06f", linewidth=6)
-for (x, _, z), name in zip(arm.objects[0], arm.names, strict=True):
-    if not name.startswith(("burner", "knob")):
-        right.plot(x, z, "s", color=WALL, markeredgecolor="black")
-        right.annotate(name, (x, z), (0, 6), textcoords="offset points", ha="center", fontsize=8)
+draw_objects(right, arm.objects[0][:, [0, 2]], arm.names)
 right.set(aspect="equal", xlabel="x (m)", ylabel="z (m)")
-right.margins(x=0.35, y=0.15)
-titles = ("AntMaze, from above", f"Hopper, from the side, {len(fall) - 1} steps", "Kitchen, from behind the arm")
+right.margins(x=0.3, y=0.15)
+titles = ("AntMaze, from above", f"Hopper, {len(fall) - 1} steps", "Kitchen, from behind the arm")
 for ax, title in zip((left, middle, right), titles, strict=True):
     ax.set_title(title, fontsize=11)
 figure
@@ -216,9 +214,10 @@ dimensions.round(2)
 # %% [markdown]
 # ## Segments
 #
-# Skills are learnt from segments $\tau = (s_1, a_1, \dots, s_H, a_H)$ of $H = 10$ steps. Every step of an episode
-# starts one, and none crosses the end of an episode. A tenth of a second is short: in this maze a skill is a push, not
-# a route.
+# Skills are learnt from segments $\tau = (s_1, a_1, \dots, s_H, a_H)$ of $H = 10$ steps. None crosses the end of an
+# episode, so every step of an episode starts one except the last nine: an episode of $T$ steps has $T - 9$ segments,
+# and the data above have 19,889 - 9 · 45 = 19,484. A tenth of a second is short: in this maze a skill is a push, not a
+# route.
 
 # %%
 windows = data.windows(HORIZON)
@@ -325,6 +324,17 @@ checks.round(2)
 #    goal now?
 # 3. Bring your own: write two episodes as plain arrays and give them to `Trajectories.from_episodes`. Leave out
 #    `terminations`; what does the error say?
+#
+# <details>
+# <summary>Answers</summary>
+#
+# 1. The squares along the walls: 139 of them are visited instead of 190. Segments that start at less than 0.2 m/s
+#    become rare, 0.2 % instead of 3.3 %, so a learner would know next to nothing about a ball at rest.
+# 2. Five episodes reach our goal; with the diverse drives it is six. Neither steers to it deliberately.
+# 3. "'terminations' is missing; expected observations, actions, rewards, terminations, truncations, found ...". Nothing
+#    is guessed, because the arrays alone cannot say whether an end was an arrival or merely the end of the recording.
+#
+# </details>
 #
 # ## The same at full size
 #

@@ -17,7 +17,7 @@
 # skills before your eyes, with the health of its codebook next to the loss, the same training without any care for the
 # codebook, and what the skills came to mean: each of them replayed from eight starts.
 #
-# **Time:** about one minute on two CPU cores. No network, no GPU, no graphics driver.
+# **Time:** one to two minutes on two CPU cores. No network, no GPU, no graphics driver.
 
 # %%
 # %matplotlib inline
@@ -56,7 +56,7 @@ RUNS = Path("../runs/notebooks/02")  # what this notebook writes lies here
 # ## What vector quantisation does
 #
 # An encoder turns a segment of ten steps into a point $E(\tau)$. The **codebook** holds $K$ vectors $z_1 \dots z_K$,
-# and the segment's skill is simply the nearest of them (equation 10):
+# and the segment's skill is simply the nearest of them (equation 11):
 #
 # $$k = \arg\min_j \lVert E(\tau) - z_j \rVert$$
 #
@@ -140,11 +140,11 @@ class Watch(pl.Callback):
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx):
         if trainer.global_step % self.every and trainer.global_step != trainer.max_steps:
             return
-        share = module.bottleneck.usage
-        perplexity = (-torch.special.xlogy(share, share).sum()).exp()
+        usage = module.bottleneck.usage
+        perplexity = module.bottleneck.health()["perplexity"]
         terms = {name: value.item() for name, value in module.terms.items()}
         self.rows.append({"step": trainer.global_step, "perplexity": perplexity.item(), **terms})
-        picture = self.draw(share.tolist(), trainer.max_steps)
+        picture = self.draw((usage / usage.sum()).tolist(), trainer.max_steps)
         if self.handle is None:
             self.handle = display(picture, display_id=True)
         else:
@@ -159,7 +159,7 @@ class Watch(pl.Callback):
         left.set(xlabel="step", ylabel="loss", xlim=(0, steps), ylim=(0, None))
         left.legend(frameon=False)
         middle.plot(table["step"], table["perplexity"], color="#10a06f")
-        middle.set(xlabel="step", ylabel="perplexity", xlim=(0, steps), ylim=(0, SKILLS + 0.3))
+        middle.set(xlabel="step", ylabel="perplexity", xlim=(0, steps), ylim=(0, SKILLS * 1.04))
         right.bar(range(len(share)), share, color=[skill_colour(k) for k in range(len(share))])
         right.axhline(1 / len(share), color="black", linewidth=0.8, linestyle="--")
         right.set(xlabel="code", ylabel="share of the data", xticks=range(len(share)))
@@ -206,10 +206,11 @@ pd.Series({**health, "rmse of guessing zero": guess}).round(3).to_frame("held-ou
 #
 # Codebooks are known to **collapse**: a vector that is never the nearest gets no gradient, and so never becomes the
 # nearest. Two measures prevent it here: the codebook starts at the centres of the first encodings (k-means), and a dead
-# code is restarted at a point that is far from every vector. Now without either, from random normal vectors:
+# code is restarted at a point that is far from every vector. Now without either, from random normal vectors, for just
+# as many steps:
 
 # %%
-careless, _, careless_watch = learn(max(STEPS // 4, 1), codebook_init="normal", restart_threshold=0.0)
+careless, _, careless_watch = learn(STEPS, codebook_init="normal", restart_threshold=0.0)
 collapsed = tester.validate(careless, datamodule=segments, verbose=False)[0]
 print(f"with care:    {health['codes_used']:.0f} of {SKILLS} codes in use, perplexity {health['perplexity']:.1f}")
 print(f"without care: {collapsed['val/codes_used']:.0f} of {SKILLS} codes in use, "
@@ -308,6 +309,19 @@ checks.round(2)
 # 2. `learn(STEPS, decoder="mlp")` replaces diffusion by plain regression. Which one draws the same action twice in the
 #    same state? Compare the two on segments that begin at a junction.
 # 3. Bring back only one of the two measures (`codebook_init="kmeans"`, or `restart_threshold=0.1`). Which does more?
+#
+# <details>
+# <summary>Answers</summary>
+#
+# 1. With 4, 8 and 16 skills: perplexity 3.5, 7.1 and 13.8, error of the actions 0.45, 0.40 and 0.37. Four pushes take a
+#    ball anywhere, but more of them copy the data more closely: finer directions, and corrections.
+# 2. The MLP draws the same action every time; two draws of the diffusion decoder differ by 0.24 on average. The MLP's
+#    error is smaller (0.33 against 0.40), because a mean is the best single guess. Where drives part, though, the mean
+#    of left and right is a way that nobody took.
+# 3. With this seed each is enough by itself: all eight codes stay in use, at perplexity 7.3 with k-means alone and 6.9
+#    with restarts alone, against 4 codes and 3.3 with neither.
+#
+# </details>
 #
 # ## The same at full size
 #

@@ -73,7 +73,7 @@ print(f"{data.num_steps:,} steps in {data.num_episodes} episodes: {reached.sum()
 # ## Cut and name
 #
 # The encoder of notebook 02 maps a segment $\tau$ of ten states and actions to a point, and the nearest vector of the
-# codebook gives the segment its code (equation 10): $k = \arg\min_j \lVert E(\tau) - z_j \rVert$. Here is the longest
+# codebook gives the segment its code (equation 11): $k = \arg\min_j \lVert E(\tau) - z_j \rVert$. Here is the longest
 # drive that enters the goal, first as a sequence of steps, then, segment by segment, as a sequence of skills.
 
 # %%
@@ -230,8 +230,9 @@ figure
 # ## How long they last, and how they end
 #
 # Nearly all segments have ten steps. The few shorter ones end in the goal: a drive that enters it yields one segment
-# each of 1, 2, ... 9 and 10 steps that contains the arrival (on the right: where they begin). They are fewer than one
-# in a hundred, and they are the *only* rows that say that anything good ever happens.
+# each of 1, 2, ... 9 and 10 steps that contains the arrival (on the right: where they begin). One of the 23 drives has
+# only five steps in all, so 225 rows enter the goal and not 230. They are fewer than one in a hundred, and they are the
+# *only* rows that say that anything good ever happens.
 
 # %%
 figure = Figure(figsize=(9.5, 3.0), layout="constrained")
@@ -383,6 +384,19 @@ checks.round(3)
 #    0.05. How far is it from the start?
 # 3. Replace the expectile 0.9 by 0.5 (the mean over all drives, wherever they were headed). Does the map still lead
 #    from the start to the goal?
+#
+# <details>
+# <summary>Answers</summary>
+#
+# 1. The codes of notebook 02 follow themselves more often, 38 % of the time against 29 %, but with eight codes chance
+#    gives more, too: 2.5 times as often as by chance against 4.1 times. The table with sixteen codes is the better one
+#    to learn from: its rows say more precisely what was done.
+# 2. Going back from the goal along the shortest way, 6.5 m from the goal and 9.5 m from the start. With one $\gamma$
+#    per skill no two neighbours on that way differ by less than 0.05.
+# 3. It does: climbing from square to square still ends beside the goal. But V at the start is -83 instead of -33,
+#    because most drives went elsewhere first, and its agreement with the right map falls to a correlation of 0.68.
+#
+# </details>
 #
 # ## The same at full size
 #

@@ -574,6 +574,18 @@ checks.round(2)
 # 3. How many episodes does it take to distinguish 90 % from 95 %? Work it out with `wilson`, then look at the tables of
 #    papers.
 #
+# <details>
+# <summary>Answers</summary>
+#
+# 1. With the loop above, seed 3: it falls after 494 steps. Of 60 episodes of `rollout` with seed 0, six end in a fall.
+# 2. The first guess already points the right way, but its cloud is wider: for the likeliest skill the standard
+#    deviation along x is 0.08 instead of 0.02, along y 0.18 instead of 0.12, and a single action still changes by 0.2
+#    (root mean square) in the passes that follow.
+# 3. More than 400 of each: with 400 episodes the intervals of 90 % (86.7 to 92.6) and 95 % (92.4 to 96.7) still
+#    overlap, with 450 they no longer do. Tables of papers usually rest on 100 episodes or fewer.
+#
+# </details>
+#
 # ## The same at full size
 #
 # ```bash

@@ -648,14 +648,28 @@ checks.round(2)
 #    an agent that stands in front of a wall?
 # 3. Mark every truncation as a termination. What does the value map look like, and why?
 #
+# <details>
+# <summary>Answers</summary>
+#
+# 1. The skills stay; relabelling and the policy are made anew. `rewards` and `terminations` of the steps that enter the
+#    new dock or entered the old one change, and a drive that enters the new dock ends there.
+# 2. Without it not one segment drives backwards (2.4 % with it), so no skill can, and hardly any segment stands still
+#    for its whole second (0.1 % instead of 3.0 %). An agent in front of a wall is then in a state that the data never
+#    show, with skills that only go forwards.
+# 3. As in notebook 03: wherever a recording happened to stop, the costs stop, and such places look like docks. Expect a
+#    map that is bright wherever drives ended, and no way to the dock in it.
+#
+# </details>
+#
 # ## The same at full size
 #
 # Stage by stage, with your arrays in a folder; no task is named, so widths come from the data:
 #
 # ```bash
-# dds data check runs/cart-data --horizon 10
-# dds skill fit --config pointmaze/skill.yaml --data.data arrays:runs/cart-data --checkpoint.dirpath runs/cart-skill
-# dds policy fit --config pointmaze/policy.yaml --data.data arrays:runs/cart-data \
+# dds data check runs/notebooks/08/cart-data --horizon 10
+# dds skill fit --config pointmaze/skill.yaml --data.data arrays:runs/notebooks/08/cart-data \
+#     --checkpoint.dirpath runs/cart-skill
+# dds policy fit --config pointmaze/policy.yaml --data.data arrays:runs/notebooks/08/cart-data \
 #     --data.skill runs/cart-skill/last.ckpt --data.reward_scale 0.1 --data.reward_shift=-1 \
 #     --model.fourier_seen 2 --checkpoint.dirpath runs/cart-policy
 # dds publish - shared/cart --skill runs/cart-skill/last.ckpt --policy runs/cart-policy/last.ckpt

@@ -1,5 +1,6 @@
 """Starting from a checkpoint: what is loaded, what is frozen to the bit, what is refused."""
 
+import re
 import warnings
 
 import lightning.pytorch as pl
@@ -114,6 +115,10 @@ def test_of_other_observations_what_fits_is_loaded_and_the_rest_is_listed(starts
     misfits = {"encoder.embedding.weight", "decoder.net.input.weight", "normaliser.mean", "normaliser.std"}
     assert {name for name in source if f"{name} (" in message} == misfits
     assert "encoder.embedding.weight (16, 5), (16, 8)" in message
+    fits, every, data, anew = map(int, re.findall(r"(?:in|of|;) (\d+)", message))
+    assert every == len(source) == fits + data + anew
+    (listed,) = re.findall("come from the new data: ([^;]*);", message)
+    assert (len(listed.split(", ")), message.partition("here): ")[2].count(";") + 1) == (data, anew)
     now = state(module)
     for name in source:
         if name in misfits:

@@ -142,6 +142,37 @@ def test_its_commands_parse(script):
             build_parser()[0].parse_args(prepare(words))
 
 
+def written_by(words):
+    """Where a command of the prose writes."""
+    if words[0] == "publish":
+        return words[2:3]
+    return [words[i + 1] for i, word in enumerate(words[:-1]) if word in ("--out", "--checkpoint.dirpath")]
+
+
+def test_commands_read_only_what_the_repository_the_notebook_or_an_earlier_command_holds():
+    there = []
+    for script in SCRIPTS:
+        number, code = script.stem[:2], "\n".join(cell.source for cell in cells_of(script, "code"))
+        for words in commands_of(script):
+            made = written_by(words)
+            for word in words:
+                path = word.partition(":")[2] or word
+                if not path.startswith(("runs/", "data/", "checkpoints/", "shared/")) or word in made:
+                    continue
+                own = path.removeprefix(f"runs/notebooks/{number}/")
+                ours = own != path and f'RUNS / "{own.split("/")[0]}"' in code
+                earlier = any(path == one or path.startswith(f"{one}/") for one in there)
+                assert ours or earlier or (HERE.parent / path).exists(), f"{script.stem}: {path} in {' '.join(words)}"
+            there += made
+
+
+@each_script
+def test_each_exercise_has_its_answer(script):
+    exercises, _, answers = prose_of(script).partition("## Exercises")[2].partition("<summary>Answers</summary>\n\n")
+    numbers = [re.findall(r"^(\d)\. ", part.partition("</details>")[0], re.MULTILINE) for part in (exercises, answers)]
+    assert numbers[0] == numbers[1] == [str(i + 1) for i in range(len(numbers[0]))] != []
+
+
 @pytest.mark.slow
 @each_script
 def test_it_runs(script):

@@ -6,7 +6,11 @@ from torchmetrics import Metric
 
 
 def perplexity(share: Tensor) -> Tensor:
-    """``exp(H)`` of a distribution over codes (K,), as a scalar: K if uniform, 1 after a collapse."""
+    """``exp(H)`` of a distribution over codes (K,), as a scalar: K if uniform, 1 after a collapse.
+
+    The shares need not sum to 1: after a restart of dead codes, the running usage of a codebook does not.
+    """
+    share = share / share.sum().clamp_min(torch.finfo(share.dtype).tiny)
     return (-torch.special.xlogy(share, share).sum()).exp()
 
 

@@ -56,14 +56,14 @@ def find_subject(place: Path, seed: int = 0) -> Subject:
         UserError: The path holds none of these.
     """
     if place.is_file() or place.suffix == ".ckpt":
-        return Subject(_skills_alone(place, seed), None, None, None, f"skill checkpoint {place}")
+        return Subject(_skills_alone(place, seed), None, None, None, f"skill checkpoint {_shown(place)}")
     recall_task(place)
     data, task = _data_of(place)
     if not (place / "model.safetensors").is_file() and not (place / "agent" / "model.safetensors").is_file():
         checkpoint = place / "skill" / "last.ckpt"
         if read_marker(place / "skill").get("state") == "finished" and checkpoint.is_file():
             return Subject(
-                _skills_alone(checkpoint, seed), task, data, None, f"skills of the run {place}, no policy yet"
+                _skills_alone(checkpoint, seed), task, data, None, f"skills of the run {_shown(place)}, no policy yet"
             )
         if data is not None:
             raise UserError(f"{place} is a run whose skills are not trained yet: finish them with `dds run`")
@@ -73,7 +73,7 @@ def find_subject(place: Path, seed: int = 0) -> Subject:
     kept = restore_task(load_published(directory).config, directory)
     task = kept.name if kept else task
     found = Findings.read(place) if (place / "evaluate" / "episodes.parquet").is_file() else None
-    return Subject(DDSAgent.load(directory, seed=seed), task, data, found, f"published agent {directory}")
+    return Subject(DDSAgent.load(directory, seed=seed), task, data, found, f"published agent {_shown(directory)}")
 
 
 def _skills_alone(checkpoint: Path, seed: int) -> DDSAgent:
@@ -130,12 +130,26 @@ def atlas(
     made = make_atlas(
         subject.agent, wanted, trajectories, result, main, singles, others=others, seed=seed, announce=announce
     )
-    command = ["dds", "atlas", str(place), "--data", spec, "--task", wanted.name, "--seed", str(seed)]
+    source, _, where = spec.partition(":")
+    spec = f"{source}:{_shown(where)}"
+    command = ["dds", "atlas", _shown(place), "--data", spec, "--task", wanted.name, "--seed", str(seed)]
     announce("writing the page")
     if figures is not None:
         write_pictures(made, figures, out.stem)
     about = _about(subject, wanted, spec, result, main)
-    return made, write_atlas(made, out, about, shlex.join([*command, "--out", str(out)]))
+    return made, write_atlas(made, out, about, shlex.join([*command, "--out", _shown(out)]))
+
+
+def _shown(place: str | Path) -> str:
+    """Return a path as the page names it: others read the page, and folders of the maker's machine are not for them."""
+    path = Path(place)
+    if not path.is_absolute():
+        return str(place)
+    if path.is_relative_to(Path.cwd()):
+        return str(path.relative_to(Path.cwd()))
+    if path.parent.name == "snapshots" and path.parts[-3].startswith("models--"):  # of the Hub's cache
+        return f"hf:{path.parts[-3].removeprefix('models--').replace('--', '/', 1)}@{path.name}"
+    return path.name
 
 
 def _episodes(
@@ -171,5 +185,7 @@ def _about(
     if result is not None and main is not None:
         row = result.summary().set_index("actor").loc[main]
         reached = f"{row['success']:.0f} % succeed" if task.measures_success else f"score {row['score']:.1f}"
-        lines.append(("policy", f"{main}: {reached}, {row['episodes']:.0f} episodes"))
+        lines.append(
+            ("policy", f"{main}: {reached}, {row['episodes']:.0f} episode{'' if row['episodes'] == 1 else 's'}")
+        )
     return lines

@@ -52,9 +52,11 @@ def test_a_published_agent_has_its_page_where_it_was_asked_for(dds, place):
     text = Path("my.html").read_text(encoding="utf-8")
     assert "Skill atlas: pointmaze-umaze-diverse" in text
     assert "--episodes" not in text.split("<footer>")[0]
+    assert str(place) not in text  # others read it: the folders of its maker are not for them
+    assert "<code>dds atlas agent --data arrays:data " in text
     assert sorted(path.name for path in Path().iterdir()) == ["my.html", "pictures"]
     pictures = sorted(path.name for path in Path("pictures").iterdir())
-    assert len(pictures) == text.count("<figure>")
+    assert len(pictures) == text.count("<figure ")
     assert {"my-starts-by-skill.png", "my-recovery.png", "my-values.png", "my-diversity.png"} <= set(pictures)
     assert not [entry for entry in (place / "agent").iterdir() if entry.suffix == ".html"]
 
@@ -78,6 +80,20 @@ def test_a_run_with_skills_alone_knows_its_data_and_compares_with_others(dds, pl
     status, _, err = dds("atlas", run)
     assert status == 2
     assert "whose skills are not trained yet" in err
+
+
+@pytest.mark.parametrize(
+    ("place", "shown"),
+    [
+        ("{here}/runs/hop", "runs/hop"),
+        ("runs/hop", "runs/hop"),
+        ("../data", "../data"),
+        ("/home/anna/secret/hop", "hop"),
+        ("/home/anna/.cache/hub/models--anna--my-hop/snapshots/12ab", "hf:anna/my-hop@12ab"),
+    ],
+)
+def test_a_page_names_no_folder_of_its_makers_machine(place, shown):
+    assert atlas._shown(place.format(here=Path.cwd())) == shown
 
 
 def refused(answer, *parts):

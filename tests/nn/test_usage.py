@@ -14,6 +14,11 @@ def test_perplexity_is_the_number_of_codes_that_are_used_alike():
     assert perplexity(torch.tensor([0.75, 0.25])).item() == pytest.approx((4 / 3) ** 0.75 * 4**0.25)
 
 
+def test_perplexity_is_at_most_the_number_of_codes_whatever_the_shares_sum_to():
+    assert perplexity(torch.tensor([0.3, 0.3, 0.3, 0.3])).item() == pytest.approx(4.0)
+    assert perplexity(torch.tensor([3.0, 1.0])).item() == pytest.approx((4 / 3) ** 0.75 * 4**0.25)
+
+
 def test_usage_counts_an_epoch_not_its_batches_and_begins_anew_after_a_reset():
     usage = CodebookUsage(4, threshold=0.5)
     usage.update(torch.tensor([0, 0, 0, 1]))
@@ -34,4 +39,5 @@ def test_a_code_is_in_use_from_the_threshold_share_on():
 
 
 def test_before_the_first_code_nothing_is_in_use():
-    assert CodebookUsage(3).compute()["codes_used"].item() == 0.0
+    found = CodebookUsage(3).compute()
+    assert (found["codes_used"].item(), found["perplexity"].item()) == (0.0, 1.0)

@@ -1,11 +1,15 @@
 """The card tells what a stranger must know before using an agent."""
 
+import re
+from pathlib import Path
+
 import pandas as pd
 import pytest
 
 from dds_lightning.study.card import agent_card, with_diagnosis
 from dds_lightning.tasks import get_task
 
+SHIPPED = Path(__file__).parents[2] / "checkpoints"
 SETTINGS = {
     "skill": {
         "model": {"num_skills": 16, "skill_dim": 64},
@@ -80,6 +84,15 @@ def test_the_last_section_is_about_this_task_and_these_data(name, source, known,
     if name.startswith("hopper"):
         assert "success" not in text
         assert "normalised score **75.0 ± 25.0** over 4 episodes, mean return 0.8" in text
+
+
+@pytest.mark.parametrize("place", sorted(path.parent for path in SHIPPED.glob("*/config.yaml")), ids=lambda p: p.name)
+def test_the_last_section_of_a_shipped_card_is_what_is_written_today(place):
+    text = (place / "README.md").read_text(encoding="utf-8")
+    task, source = re.search(r"get_task\(\"(.*?)\"\)", text)[1], re.search("^- source: (.*)$", text, re.MULTILINE)[1]
+    success = [True] * 6 if get_task(task).measures_success else [None] * 6
+    last = "## What it cannot do"
+    assert text.partition(last)[2] == card(task, source, success).partition(last)[2]
 
 
 def test_a_published_runs_card_says_which_stage_loses(tmp_path, monkeypatch):

@@ -21,6 +21,7 @@ from dds_lightning.interpret.draw.drawing import (
     grid,
     heading,
     panel_height,
+    write_title,
 )
 from dds_lightning.interpret.draw.palette import NO_SKILL, SKILL_COLOURS, WALL, ink, skill_colour
 from dds_lightning.interpret.measure.statistics import telling_dimensions
@@ -216,7 +217,7 @@ def plot_where(task: Task | None, segments: CodedSegments) -> Figure:
         heading(ax, int(code), f"{segments.share[code]:.0%} of the data")
     figure.supxlabel(names[across], fontsize=LABEL - 2)
     figure.supylabel(names[up], fontsize=LABEL - 2)
-    figure.suptitle("States in which each code begins in the data (grey: all)", fontsize=TICKS)
+    write_title(figure, "States in which each code begins in the data (grey: all)", TICKS)
     return figure
 
 

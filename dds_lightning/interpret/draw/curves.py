@@ -1,10 +1,12 @@
 """Training curves from the metrics.csv that every fit writes."""
 
+import textwrap
 from pathlib import Path
 
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 PANELS = {
     "skill": (
@@ -20,6 +22,10 @@ PANELS = {
         ("val/code_accuracy", "agreement with the data's code"),
     ),
 }
+COUNTS = ("val/codes_used",)
+"""Columns of whole numbers, whose axes begin at zero."""
+WRAP = 22
+"""Maximum number of letters of a title on one line: a panel is narrow."""
 
 
 def read_metrics(path: str | Path) -> pd.DataFrame:
@@ -55,9 +61,10 @@ def plot_training_curves(stages: dict[str, Path]) -> Figure:
 
 
 def _curve(ax: Axes, table: pd.DataFrame, column: str, label: str) -> None:
-    ax.set_title(label, fontsize=7.5)
+    ax.set_title(textwrap.fill(label, WRAP), fontsize=7.5)
     ax.tick_params(labelsize=6.5)
     ax.set_xlabel("optimiser step", fontsize=6.5)
+    ax.xaxis.set_major_locator(MaxNLocator(nbins=4, integer=True))
     ax.spines[["top", "right"]].set_visible(False)
     if column in table:
         points = table[["step", column]].dropna()
@@ -68,5 +75,6 @@ def _curve(ax: Axes, table: pd.DataFrame, column: str, label: str) -> None:
             linewidth=1.2,
             marker="." if len(points) < 12 else "",
         )
-        if column.endswith("codes_used"):  # a count starts at zero
-            ax.set_ylim(bottom=0.0)
+    if column in COUNTS:
+        ax.yaxis.set_major_locator(MaxNLocator(integer=True))
+        ax.set_ylim(0.0, ax.get_ylim()[1] + 0.5)  # room for a mark at the top

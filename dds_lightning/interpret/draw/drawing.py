@@ -4,6 +4,7 @@ A maze is seen from above with y up, as in the simulator: a left turn is a left 
 AntMaze), the map's first row is therefore the lowest.
 """
 
+import textwrap
 from collections.abc import Iterable
 from functools import partial
 from typing import Any
@@ -23,6 +24,8 @@ from dds_lightning.tasks import Task
 LABEL, TICKS, NUMBER = 12.0, 11.0, 9.0
 """Font sizes of a figure 7 inches wide: printed in a column of 3.5 inches they are halved."""
 
+LETTER = 0.0075
+"""Width of a letter of text, on average, in inches per point of its size."""
 CROPPED = 0.6
 """How much of the outer wall, in cells, small panels leave out on each side."""
 
@@ -181,9 +184,16 @@ def heading(ax: Axes, code: int, text: str = "") -> None:
         put(text, xytext=(22, 4))
 
 
+def write_title(figure: Figure, text: str, size: float = LABEL) -> None:
+    """Write a title above all panels, on as many lines as the figure's width asks for."""
+    lines = textwrap.wrap(text, int(figure.get_figwidth() / (LETTER * size)))
+    figure.set_figheight(figure.get_figheight() + (len(lines) - 1) * size * 1.3 / 72)
+    figure.suptitle("\n".join(lines), fontsize=size)
+
+
 def frame(figure: Figure, axes: Iterable[Axes], task: Task, title: str) -> None:
     """Finish panels that are too small for axes: no ticks, the scale in the title."""
     for ax in axes:
         crop(ax, task)
         ax.set(xlabel="", ylabel="", xticks=[], yticks=[])
-    figure.suptitle(f"{title} (a wall square: {task.cell_size:g} m)", fontsize=TICKS)
+    write_title(figure, f"{title} (a wall square: {task.cell_size:g} m)", TICKS)

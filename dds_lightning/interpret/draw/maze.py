@@ -29,6 +29,7 @@ from dds_lightning.interpret.draw.drawing import (
     heading,
     maze_figure,
     panel_height,
+    write_title,
     zoom,
 )
 from dds_lightning.interpret.draw.palette import GOAL, START, START_EDGE, skill_colour
@@ -174,7 +175,8 @@ def plot_starts_by_skill(
         draw_starts(ax, [positions[n, 0] for n in members], task.cell_size, size=7)
         heading(ax, int(code))
     places = len(np.unique(np.asarray(starts), axis=0))
-    frame(figure, axes, task, f"Each skill alone from {places} starts, {positions.shape[1] - 1} steps")
+    starting = f"{places} start{'' if places == 1 else 's'}"
+    frame(figure, axes, task, f"Each skill alone from {starting}, {positions.shape[1] - 1} steps")
     return figure
 
 
@@ -216,7 +218,7 @@ def plot_skills_by_start(
         ax.label_outer()
         ax.tick_params(labelbottom=True, labelleft=True)
     steps = positions.shape[1] - 1
-    figure.suptitle(f"Every skill alone from the same start, {steps} steps; one panel per start", fontsize=LABEL)
+    write_title(figure, f"Every skill alone from the same start, {steps} steps; one panel per start")
     return figure
 
 

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from dds_lightning.errors import UserError
-from dds_lightning.interpret.draw.drawing import LABEL, grid, heading
+from dds_lightning.interpret.draw.drawing import LABEL, grid, heading, write_title
 from dds_lightning.tasks import Task, facts_to_keep
 
 BACKENDS = ("egl", "osmesa", "glfw")
@@ -97,7 +97,7 @@ def plot_rendered(task: Task, frames: dict[int, NDArray[np.uint8]], every: int) 
                 heading(ax, code, f"{0:.2f} s")
             else:
                 ax.set_title(f"{t * every * task.step_seconds:.2f} s", fontsize=9)
-    figure.suptitle("The same frames rendered by MuJoCo", fontsize=LABEL - 1)
+    write_title(figure, "The same frames rendered by MuJoCo", LABEL - 1)
     return figure
 
 

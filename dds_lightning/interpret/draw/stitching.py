@@ -11,7 +11,16 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from dds_lightning.errors import UserError
-from dds_lightning.interpret.draw.drawing import LABEL, TICKS, crop, draw_path, draw_starts, draw_walls, panel_height
+from dds_lightning.interpret.draw.drawing import (
+    LABEL,
+    TICKS,
+    crop,
+    draw_path,
+    draw_starts,
+    draw_walls,
+    panel_height,
+    write_title,
+)
 from dds_lightning.interpret.draw.palette import ink, skill_colour
 from dds_lightning.rollout.result import RolloutPath, RolloutResult
 from dds_lightning.tasks import Task
@@ -101,7 +110,7 @@ def plot_stitching(task: Task, result: RolloutResult, actor: str, episodes: int 
         sequences = [codes[:SPAN] for codes in sequences]
         title += f" in the first {SPAN} steps"
     draw_timeline(timeline, sequences, _names(task, table, chosen))
-    figure.suptitle(f"{actor}: {title}", fontsize=LABEL)
+    write_title(figure, f"{actor}: {title}")
     return figure
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from dds_lightning.errors import UserError
-from dds_lightning.interpret.draw.drawing import LABEL, TICKS, draw_walls, grid, heading
+from dds_lightning.interpret.draw.drawing import LABEL, TICKS, draw_walls, grid, heading, write_title
 from dds_lightning.interpret.draw.gif import CachedBackground, gif_bytes
 from dds_lightning.interpret.draw.palette import NO_SKILL, WALL, skill_colour
 from dds_lightning.interpret.measure.body import BodyFrames
@@ -76,7 +75,7 @@ def plot_strobes(
         if view.axes == (0, 1):
             ax.plot(*body.root[:, view.axes].T, color="black", linewidth=1.2, zorder=5)
         if len(body.names):
-            _draw_objects(ax, view, body, skill_colour(code))
+            _draw_moved(ax, view, body, skill_colour(code))
         ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
         ax.tick_params(labelsize=TICKS - 2)
         falls = view.ground and len(body) < max(map(len, frames.values()))
@@ -87,7 +86,7 @@ def plot_strobes(
         ax.label_outer()
         ax.tick_params(labelbottom=True, labelleft=True)
     shown_title = title or f"Each skill from the same state, a body every {every * seconds:g} s"
-    figure.suptitle(shown_title, fontsize=LABEL - 1)
+    write_title(figure, shown_title, LABEL - 1)
     return figure
 
 
@@ -163,11 +162,20 @@ def _scene(ax: Axes, task: Task, view: View, body: BodyFrames) -> None:
         ax.axhspan(-10.0, 0.0, color=WALL, zorder=0)
         ax.spines[["top", "right"]].set_visible(False)
     if len(body.names):
-        for place, name in zip(body.objects[0][:, view.axes], body.names, strict=True):
-            ax.plot(*place, "s", color=WALL, markeredgecolor=NO_SKILL, markersize=4, zorder=1)
-            if name and not name.startswith(("burner", "knob")):
-                put = partial(ax.annotate, textcoords="offset points", ha="center", fontsize=7, color=NO_SKILL)
-                put(name, place, (0, 5))
+        draw_objects(ax, body.objects[0][:, view.axes], body.names)
+
+
+def draw_objects(ax: Axes, places: Floats, names: Sequence[str]) -> None:
+    """Draw a square at each place (M, 2), and write the name of each kind of object once, above its squares."""
+    stems = [name.rstrip(" 0123456789") for name in names]
+    kinds = [stem if stem == name else f"{stem}s" for stem, name in zip(stems, names, strict=True)]
+    for kind in dict.fromkeys(kinds):
+        members = places[[one == kind for one in kinds]]
+        ax.plot(*members.T, "s", color=WALL, markeredgecolor=NO_SKILL, markersize=4, zorder=1)
+        above = (float(members[:, 0].mean()), float(members[:, 1].max()))
+        # To the left of a single one, whose neighbour may be close; above the middle of several.
+        shift, side = (4, "right") if len(members) == 1 else (0, "center")
+        ax.annotate(kind, above, (shift, 5), textcoords="offset points", ha=side, fontsize=7, color=NO_SKILL)
 
 
 def _draw_body(ax: Axes, view: View, body: BodyFrames, t: int, colour: Any) -> None:
@@ -176,7 +184,7 @@ def _draw_body(ax: Axes, view: View, body: BodyFrames, t: int, colour: Any) -> N
     ax.plot(*body.joints[t][:, view.axes].T, ".", color="black", markersize=2.2, alpha=float(colour[3]), zorder=4)
 
 
-def _draw_objects(ax: Axes, view: View, body: BodyFrames, colour: str) -> None:
+def _draw_moved(ax: Axes, view: View, body: BodyFrames, colour: str) -> None:
     """Draw the paths of the objects that the arm moved."""
     for path in np.moveaxis(body.objects[:, :, view.axes], 1, 0):
         if np.linalg.norm(path[-1] - path[0]) > 0.01:

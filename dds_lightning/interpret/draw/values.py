@@ -35,13 +35,18 @@ STAYS = 0.02
 
 
 def value_and_codes(policy: PolicyModule) -> tuple[ValueFunction, CodeFunction]:
-    """Return V and the likeliest code of a policy as functions of NumPy observations (N, O)."""
+    """Return V and the likeliest code of a policy as functions of NumPy observations (N, O).
+
+    V is clamped to the range that the rewards and discounts of the policy's data allow: a network may err beyond it,
+    for example above 0 beside a goal in a maze where every step costs something.
+    """
     policy.eval()
     device = next(policy.parameters()).device
+    least, most = policy.value_range.tolist()
 
     @torch.inference_mode()
     def value(observations: NDArray[np.float32]) -> NDArray[np.float32]:
-        return policy.v(torch.from_numpy(observations).to(device)).cpu().numpy()
+        return policy.v(torch.from_numpy(observations).to(device)).clamp(least, most).cpu().numpy()
 
     @torch.inference_mode()
     def codes(observations: NDArray[np.float32]) -> NDArray[np.int64]:

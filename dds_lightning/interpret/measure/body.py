@@ -27,11 +27,11 @@ ARM = 9
 THINGS = {
     "slidelink": "slide cabinet",
     "hingeleftdoor": "hinge cabinet",
-    "hingerightdoor": "",
+    "hingerightdoor": "hinge cabinet",
     "microdoorroot": "microwave",
     "kettle": "kettle",
     "lightswitchroot": "light switch",
-    "lightblock_hinge": "",
+    "lightblock_hinge": "light",
 }
 """Bodies of the kitchen's model -> their labels; knobs and burners keep their names."""
 
@@ -48,7 +48,7 @@ class BodyFrames:
         joints: (T, J, 3) metres, the joints between limbs.
         root: (T, 3) metres: the torso, in the kitchen the hand.
         objects: (T, M, 3) metres: the movable objects in the kitchen; M = 0 elsewhere.
-        names: M names of the objects.
+        names: M names of the objects; both doors of a cabinet have its name.
     """
 
     limbs: Floats

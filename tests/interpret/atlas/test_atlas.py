@@ -36,7 +36,7 @@ class Reader(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.tags.append((tag, dict(attrs)))
-        if tag not in ("meta", "img", "br"):
+        if tag not in ("meta", "img", "br", "input"):
             self.open.append(tag)
 
     def handle_endtag(self, tag):
@@ -133,6 +133,11 @@ def test_the_page_needs_nothing_but_itself(maze, tmp_path):
     assert not re.search(r"https?://|<script|<link|@import|url\(", text)
     assert "prefers-color-scheme: dark" in text
     assert 'name="viewport"' in text
+    assert len(read.all("input")) == len(read.all("label")) == len(maze.pictures)  # each can be enlarged, by keys too
+    widths = [style["style"] for style in read.all("figure")]
+    assert widths == [f"--w:{image['width']}" for image in images if image["src"].startswith("data:image/png")]
+    assert re.search(r"\.picture img \{[^}]*width: 100%; height: auto", text)  # it scales with the window
+    assert not re.search(r"(header|main)[^{]*\{[^}]*max-width", text)  # the page is as wide as the window
     anchors = {attributes["id"] for _, attributes in read.tags if "id" in attributes}
     links = [link["href"] for link in read.all("a")]
     assert links

@@ -1,5 +1,8 @@
 """Figures hold what the tables say: walls, paths, codes, ends."""
 
+import io
+from itertools import pairwise
+
 import imageio.v3 as imageio
 import numpy as np
 import pandas as pd
@@ -9,7 +12,7 @@ from matplotlib.colors import to_rgba
 
 from dds_lightning.errors import UserError
 from dds_lightning.interpret.draw.clip import write_clip
-from dds_lightning.interpret.draw.curves import plot_training_curves
+from dds_lightning.interpret.draw.curves import PANELS, plot_training_curves
 from dds_lightning.interpret.draw.maze import (
     choose_episodes,
     plot_failures,
@@ -145,6 +148,20 @@ def test_every_skill_has_a_panel_with_every_start(replays):
     assert "from 3 starts, 10 steps" in figure.get_suptitle()
 
 
+@pytest.mark.parametrize("panels", [1, 2, 3])
+def test_no_title_is_wider_than_its_figure(replays, panels):
+    few = {name: values[:panels] for name, values in replays.items()}
+    by_code = {**few, "codes": np.arange(panels)}
+    for figure in (plot_skills_by_start(TASK, **few), plot_starts_by_skill(TASK, **by_code)):
+        figure.savefig(io.BytesIO())
+        title = figure._suptitle.get_window_extent()
+        assert figure.bbox.x0 <= title.x0 < title.x1 <= figure.bbox.x1
+        assert title.y0 > max(ax.get_window_extent().y1 for ax in figure.axes)
+    assert (
+        "from 1 start, 10 steps" in " ".join(plot_starts_by_skill(TASK, **by_code).get_suptitle().split()) or panels > 1
+    )
+
+
 def dots(ax) -> np.ndarray:
     (collection,) = [c for c in ax.collections if isinstance(c, PathCollection)]
     return collection.get_offsets()
@@ -245,6 +262,21 @@ def test_curves_draw_the_stages_that_are_there(tmp_path):
     assert figure.axes[0].lines[0].get_ydata().tolist() == [3.0, 2.0, 1.0]
     assert figure.axes[2].lines[0].get_xdata().tolist() == [50, 100]
     assert not figure.axes[3].lines
+
+
+@pytest.mark.parametrize("used", [[3, 4, 4], [7, 7, 7], [0, 1, 1]])
+def test_curves_count_codes_in_whole_numbers_and_no_title_meets_another(tmp_path, used):
+    files = {stage: tmp_path / f"{stage}.csv" for stage in PANELS}
+    for stage, panels in PANELS.items():
+        pd.DataFrame({"step": [0, 1, 2], **{column: used for column, _ in panels}}).to_csv(files[stage], index=False)
+    figure = plot_training_curves(files)
+    figure.savefig(io.BytesIO())
+    (codes,) = [ax for ax in figure.axes if ax.get_title() == "codes in use"]
+    assert all(tick == round(tick) for axis in (codes.get_yticks(), codes.get_xticks()) for tick in axis)
+    for row in (figure.axes[:4], figure.axes[4:]):
+        boxes = [ax.title.get_window_extent() for ax in row]
+        assert all(left.x1 < right.x0 for left, right in pairwise(boxes))
+        assert boxes[-1].x1 < figure.bbox.x1
 
 
 def linear(colour: str) -> np.ndarray:

@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
@@ -96,6 +97,16 @@ def test_every_free_cell_has_a_value_a_code_and_where_it_leads(agent):
     np.testing.assert_array_equal(table["code"], codes(seen))
     assert table["probability"].between(1 / 3, 1).all()
     assert (np.hypot(table["dx"], table["dy"]) > 0).any()
+
+
+def test_no_value_is_drawn_beyond_what_rewards_and_discounts_allow():
+    policy = tiny_agent(TASK).policy
+    rows = np.random.default_rng(0).normal(size=(200, 4)).astype(np.float32)
+    free = value_and_codes(policy)[0](rows)  # nothing is known about the rewards
+    middle = float(np.median(free))
+    policy.value_range.copy_(torch.tensor([middle - 0.01, middle]))
+    np.testing.assert_array_equal(value_and_codes(policy)[0](rows), np.clip(free, *policy.value_range.numpy()))
+    assert (free > middle).any()
 
 
 def test_arrows_point_where_the_code_led_from_that_cell():

@@ -125,4 +125,7 @@ def test_the_kitchens_arm_is_a_chain_with_what_it_moves_beside_it():
     assert places["kettle"][2] < places["light switch"][2] < places["slide cabinet"][2]
     figure = plot_strobes(task, {1: frames}, every=1)
     assert figure.axes[0].get_ylabel() == "z (m)"
-    assert "hand moves" in figure.axes[0].texts[-1].get_text()
+    *named, code, heading = (text.get_text() for text in figure.axes[0].texts)
+    assert (code, "hand moves" in heading) == ("1", True)
+    things = ["burners", "hinge cabinet", "kettle", "knobs", "light", "light switch", "microwave", "slide cabinet"]
+    assert sorted(named) == things  # every square has a name, each name stands once
