@@ -12,8 +12,8 @@ ROOT = Path(__file__).parent
 RUN_DEFAULTS: dict[str, Any] = {
     "data_steps": 200_000,
     "clone_steps": 16_000,
-    "selection": "sample",
-    "temperature": 0.5,  # improbable codes stay out, and an unlucky choice is not repeated for ever
+    "selection": "greedy",  # on average of all agents shipped and tried, 4 to 5 points above sampling
+    "temperature": 1.0,
     "noise_scale": None,  # the skill model's
 }
 """What a preset's `run.yaml` may set, with the defaults."""
