@@ -201,7 +201,7 @@ def test_the_best_policy_is_told_beside_the_last_and_leaves_when_it_is_not_wante
     assert (best["monitor"], best["evaluations"]) == ("rollout/score", 2)
     assert best["step"] in (10, 20)
     names = [row["contestant"] for row in said["table"]]
-    assert names[0] == "AWR policy, sampled"
+    assert names[0] == "AWR policy, greedy"
     label = f"(best of 2 evaluations while training, step {best['step']}: optimistic)"
     assert [name for name in names if label in name] == [f"AWR policy, sampled {label}", f"AWR policy, greedy {label}"]
     assert DDSAgent.load(out / "evaluate" / "best").policy is not None
