@@ -4,7 +4,6 @@ Marked `faults`: `make faults` prints the counts that README tells. A few files 
 """
 
 import json
-import shutil
 from collections import Counter
 from functools import cache
 
@@ -131,7 +130,6 @@ def make_run(folder):
             rows.append({**row, "final_code": episode, "codes": [episode, 0]})
             line = np.tile(np.float32(TASK.start_xy()), (length + 1, 1))
             paths[actor, episode] = RolloutPath(line, np.zeros(length, np.int16))
-    RolloutResult(TASK.name, pd.DataFrame(rows), paths).save(folder / "evaluate")
     (folder / "relabel").mkdir()
     (folder / "relabel" / "codes.csv").write_text(
         "code,segments,share,reward,dx,dy,distance,terminations\n0,9,0.5,-1.0,0.1,0.2,0.3,0\n1,5,0.25,-1.0,0.1,0.2,0.3,0\n"
@@ -146,10 +144,10 @@ def make_run(folder):
     (folder / "report").mkdir()
     np.savez(folder / "report" / "replays.npz", key=np.array(key), **replays)
     with locked(folder):
-        do_steps(folder)
+        do_steps(folder, RolloutResult(TASK.name, pd.DataFrame(rows), paths))
 
 
-def do_steps(folder):
+def do_steps(folder, result=None):
     """Two steps of a run; those that are done are skipped."""
     steps = RunDirectory(folder, Terminal(quiet=True))
     how = {"task": TASK.name, "environment": TASK.env_id, "episodes": 3, "seed": 0, "checkpoint": "last"}
@@ -159,14 +157,9 @@ def do_steps(folder):
     start = {"mean": -1.0, "low": -10.0, "high": None}
 
     def evaluate(place, resuming):
-        if not (place / "episodes.parquet").exists():
-            shutil.copytree(folder / "previous" / "evaluate", place, dirs_exist_ok=True)
+        result.save(place) if result else (place / "episodes.parquet").write_bytes(b"")
         return {"episodes": place / "episodes.parquet", "protocol": how, "start_value": start}
 
-    if not (folder / "evaluate" / "stage.json").exists():
-        (folder / "evaluate").rename(folder / "played")
-        (folder / "previous").mkdir(exist_ok=True)
-        (folder / "played").rename(folder / "previous" / "evaluate")
     steps.do("evaluate", "evaluate", {"seed": 0}, [data], evaluate)
 
 
