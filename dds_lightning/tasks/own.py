@@ -133,6 +133,8 @@ def _check(values: Mapping[str, Any], where: str, trusted: bool) -> None:
         ("family", trusted or re.fullmatch(r"[\w-]+", values.get("family", FAMILY)) is not None, "a preset's name"),
         ("env_id", re.fullmatch(pattern, values["env_id"]) is not None, "a name that Gymnasium knows"),
         ("max_episode_steps", values["max_episode_steps"] >= 1, "at least 1"),
+        ("max_episode_steps", trusted or values["max_episode_steps"] <= 10**6, "at most a million"),
+        ("evaluation_episodes", trusted or values.get("evaluation_episodes", 1) <= 10**5, "at most 100,000"),
         ("score_max", values["score_max"] > values["score_min"], f"more than score_min={values['score_min']}"),
         *((name, values.get(name, 1) >= 1, "at least 1") for name in ("observation_dim", "action_dim")),
         ("evaluation_episodes", values.get("evaluation_episodes", 1) >= 1, "at least 1"),
