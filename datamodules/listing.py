@@ -89,6 +89,8 @@ def _arrays(root: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
             widths = _width(arrays["observations"], "observations"), _width(arrays["actions"], "actions")
             tasks = fitting_tasks(str(facts["name"]), widths=widths)
             lengths = arrays["lengths"]
+            if lengths.ndim != 1:
+                raise DataError(f"lengths: got shape {lengths.shape}, expected (episodes,)")
             yield home, {**row, **_outline("", tasks, len(lengths), int(lengths.sum()))}
         except UserError as error:
             yield home, {**row, **_outline(problem=str(error))}

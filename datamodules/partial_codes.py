@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import time
-import zipfile
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from dds_lightning.errors import UserError
+from dds_lightning.saving.arrays import read_npz
 from dds_lightning.saving.files import written_whole
 
 
@@ -32,9 +33,11 @@ class PartialCodes:
     def read(self) -> list[Tensor]:
         """The codes of the first n segments, one tensor (n,); an empty list if no codes of this key are stored."""
         try:
-            with np.load(self.path, allow_pickle=False) as stored:
-                return [torch.from_numpy(stored["codes"])] if str(stored["key"]) == self.key else []
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            stored = read_npz(self.path)
+            codes = stored["codes"]
+            sound = codes.ndim == 1 and codes.dtype == np.int64 and str(stored["key"]) == self.key
+            return [torch.from_numpy(codes)] if sound else []
+        except (UserError, KeyError):
             return []
 
     def write(self, codes: list[Tensor]) -> None:

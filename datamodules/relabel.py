@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import save_file
 from torch import Tensor
 
@@ -30,7 +30,9 @@ from datamodules.relabelling import Relabelling
 from datamodules.trajectories import Trajectories
 from dds_lightning.console.progress import on_terminal, track
 from dds_lightning.errors import UserError
+from dds_lightning.saving.arrays import read_tensors
 from dds_lightning.saving.files import refuse_newer, written_whole
+from dds_lightning.saving.untrusted import mapping, parse_json
 from dds_lightning.skill import SkillModule
 
 FORMAT = 1
@@ -141,13 +143,11 @@ class Relabelled:
             UserError: When there is no such file, it is not a relabelled file, or it was made from something else,
                 which the message names.
         """
+        if not Path(path).exists():
+            raise UserError(f"there is no relabelled file {path}: make it with `dds relabel`")
         try:
-            with safe_open(path, framework="pt") as file:
-                metadata = file.metadata() or {}
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a dict
-        except FileNotFoundError:
-            raise UserError(f"there is no relabelled file {path}: make it with `dds relabel`") from None
-        except Exception as error:
+            tensors, metadata = read_tensors(path)
+        except UserError as error:
             raise UserError(f"{path} is not a readable relabelled file ({error}): delete it and relabel") from error
         about = _about(metadata, path)
         found = about["key"]
@@ -157,8 +157,7 @@ class Relabelled:
             raise UserError(
                 f"{path} was relabelled with other inputs ({'; '.join(wrong)}): choose another file or relabel"
             )
-        damage = _misfit(tensors, about["num_skills"])
-        if damage:
+        if damage := _misfit(tensors, about["num_skills"]):
             raise UserError(f"{path} is not a readable relabelled file ({damage}): delete it and relabel")
         return cls(**tensors, num_skills=about["num_skills"])
 
@@ -176,6 +175,12 @@ def _misfit(tensors: Mapping[str, Tensor], num_skills: int) -> str | None:
             return f"{name} has type {value.dtype}"
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
             return f"{name} contains numbers that are not finite"
+    if tensors["observations"].shape != tensors["next_observations"].shape or not tensors["observations"].shape[1]:
+        return f"next_observations have shape {tuple(tensors['next_observations'].shape)}, unlike observations"
+    for name, most in (("discounts", 1), ("dones", 1), ("starts", None), ("episodes", None)):
+        low, high = tensors[name].min().item(), tensors[name].max().item()
+        if low < 0 or (most is not None and high > most):
+            return f"{name} run from {low:g} to {high:g}, expected {'at least 0' if most is None else '0 to 1'}"
     codes = tensors["codes"]
     if int(codes.min()) < 0 or int(codes.max()) >= num_skills:
         return f"codes run from {int(codes.min())} to {int(codes.max())}, expected 0 to {num_skills - 1}"
@@ -189,10 +194,10 @@ def _about(metadata: Mapping[str, str], path: str | Path) -> dict[str, Any]:
         UserError: When a newer version wrote it, or it cannot be parsed.
     """
     try:
-        about = json.loads(metadata["about"]) if "about" in metadata else dict(metadata)
-        found = json.loads(about["key"]) if isinstance(about["key"], str) else dict(about["key"])
+        about = mapping(parse_json(metadata["about"], path) if "about" in metadata else dict(metadata), path)
+        found = mapping(parse_json(about["key"], path) if isinstance(about["key"], str) else about["key"], path)
         parsed = {"format": int(about["format"]), "num_skills": int(about["num_skills"]), "key": found}
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise UserError(f"{path} is not a readable relabelled file ({error!r}): delete it and relabel") from None
     refuse_newer(path, parsed["format"], FORMAT)
     return parsed
@@ -280,17 +285,24 @@ def relabel(
     finally:
         skill.train(was_training)
 
-    learning = settled.learning_rewards(trajectories, horizon)  # (N,)
+    return _transitions(trajectories, skill, settled, torch.cat(codes))
+
+
+def _transitions(trajectories: Trajectories, skill: SkillModule, settled: Relabelling, codes: Tensor) -> Relabelled:
+    """The transitions of every segment, given their codes (M,)."""
+    windows = trajectories.windows(skill.horizon, settled.stride, tail="terminated")
+    starts, observation_starts, lengths = windows.starts, windows.observation_starts, windows.lengths
+    learning = settled.learning_rewards(trajectories, skill.horizon)  # (N,)
     gamma = settled.gamma
     rewards = np.zeros(len(starts))
-    for i in range(horizon):
+    for i in range(skill.horizon):
         taken = i < lengths
         rewards[taken] += gamma**i * learning[starts[taken] + i]
     factor = np.full(len(starts), gamma) if settled.discount == "per_skill" else gamma**lengths
     ends = starts + lengths - 1  # (M,) last step of each segment
     return Relabelled(
         observations=torch.as_tensor(trajectories.observations[observation_starts]),
-        codes=torch.cat(codes),
+        codes=codes,
         rewards=torch.as_tensor(rewards, dtype=torch.float32),
         next_observations=torch.as_tensor(trajectories.observations[observation_starts + lengths]),
         discounts=torch.as_tensor(factor, dtype=torch.float32),
@@ -301,12 +313,33 @@ def relabel(
     )
 
 
+def refuse_other_transitions(
+    found: Relabelled, trajectories: Trajectories, skill: SkillModule, relabelling: Relabelling, path: str | Path
+) -> None:
+    """Refuse transitions that these data, skills and settings cannot give, whatever their codes.
+
+    Args:
+        found: The transitions.
+        trajectories: The data.
+        skill: The skill model; it encodes nothing here.
+        relabelling: The settings.
+        path: The file that the transitions come from, for the message.
+
+    Raises:
+        UserError: Something other than the codes differs; the message names it.
+    """
+    expected = _transitions(trajectories, skill, relabelling.for_task(None), found.codes)
+    if found.num_skills != expected.num_skills:
+        raise UserError(f"{path} has {found.num_skills} codes, the skills {expected.num_skills}: delete it and relabel")
+    for name in _STORED:
+        mine, theirs = getattr(found, name), getattr(expected, name)
+        if mine.shape != theirs.shape or not torch.allclose(mine, theirs, rtol=1e-4, atol=1e-6):
+            raise UserError(f"{path}: {name} are not what these data and settings give: delete it and relabel")
+
+
 def check_widths(trajectories: Trajectories, skill: SkillModule) -> None:
     """Refuse a skill model whose observation or action width is not the data's."""
-    for name, found in (
-        ("observation_dim", trajectories.observation_dim),
-        ("action_dim", trajectories.actions.shape[1]),
-    ):
+    for name, found in (("observation_dim", trajectories.observation_dim), ("action_dim", trajectories.action_dim)):
         expected = skill.hparams[name]
         if found != expected:
             raise UserError(

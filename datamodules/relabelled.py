@@ -14,7 +14,7 @@ from torch import Tensor
 
 from datamodules.loader import TensorLoader
 from datamodules.partial_codes import PartialCodes
-from datamodules.relabel import Relabelled, relabel, relabel_key
+from datamodules.relabel import Relabelled, refuse_other_transitions, relabel, relabel_key
 from datamodules.relabelling import Relabelling
 from datamodules.sources import load_trajectories
 from datamodules.trajectories import Trajectories
@@ -155,7 +155,9 @@ class RelabeledDataModule(pl.LightningDataModule):
         if self.transitions is not None:
             return
         path = Path(self.hparams.relabelled) if self.hparams.relabelled else self.cache_file()
-        self.transitions = Relabelled.load(path, self.key)
+        transitions = Relabelled.load(path, self.key)
+        refuse_other_transitions(transitions, self.trajectories, self.skill, self.relabelling.for_task(self.task), path)
+        self.transitions = transitions
         h = self.hparams
         _, held_out = self.trajectories.split(h.validation_fraction, h.seed, self.skill.horizon)
         validates = torch.isin(self.transitions.episodes, torch.as_tensor(held_out))

@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 from datamodules.validation import DataError
 from dds_lightning.errors import UserError
+from dds_lightning.saving.arrays import read_npy
 from dds_lightning.saving.files import folder_written_whole, mend_folder, refuse_newer
+from dds_lightning.saving.untrusted import mapping, read_json, safe_name
 
 FORMAT = 1
 
@@ -60,21 +62,23 @@ def read_arrays(
     with contextlib.suppress(OSError):
         mend_folder(folder)
     try:
-        facts = json.loads((folder / "trajectories.json").read_text(encoding="utf-8"))
-        name, version, _ = str(facts["name"]), facts["format"], facts["fingerprint"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"data: {folder / 'trajectories.json'} is missing or damaged ({error!r})") from error
+        facts = mapping(read_json(folder / "trajectories.json", root=folder), folder / "trajectories.json")
+        name, version = safe_name(facts["name"]), facts["format"]
+        if not isinstance(facts["fingerprint"], str):
+            raise UserError("the fingerprint is no text")
+    except (UserError, KeyError) as error:
+        raise DataError(f"data: {folder / 'trajectories.json'} is missing or damaged ({error})") from error
     refuse_newer(folder / "trajectories.json", version, FORMAT)
     arrays = {}
     for key, dtype in types.items():
         path = folder / f"{key}.npy"
         try:
-            arrays[key] = np.load(path, mmap_mode="r" if mmap else None, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
+            arrays[key] = read_npy(path, mmap=mmap, root=folder)
+        except UserError as error:
             raise DataError(f"data set '{name}': {path} is missing, truncated or damaged ({error})") from error
         if arrays[key].dtype != dtype:
             raise DataError(f"data set '{name}', {key}: got type {arrays[key].dtype}, expected {np.dtype(dtype)}")
-    return facts, arrays
+    return {**facts, "name": name}, arrays
 
 
 def refuse_existing(folder: Path, overwrite: bool) -> None:

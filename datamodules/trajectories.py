@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from datamodules.storage import read_arrays, save_arrays
-from datamodules.validation import DataError, validate_episode
+from datamodules.validation import DataError, check_box, validate_arrays, validate_episode
 from datamodules.windows import Windows, ranges, sliding_windows
 from dds_lightning.tasks import Task
 
@@ -121,6 +121,7 @@ class Trajectories:
         action_dim = action_dim or _width(first.get("actions")) or 1
         low = np.broadcast_to(np.asarray(action_low, np.float32), (action_dim,)).copy()
         high = np.broadcast_to(np.asarray(action_high, np.float32), (action_dim,)).copy()
+        check_box(f"data set '{name}'", low, high)
         names = episode_names or [f"episode {e}" for e in range(len(episodes))]
         checked = [
             validate_episode(name, label, fields, observation_dim=observation_dim, action_low=low, action_high=high)
@@ -292,13 +293,8 @@ class Trajectories:
             DataError: When a file is missing, damaged or does not match.
         """
         facts, arrays = read_arrays(directory, ARRAY_TYPES, mmap=mmap)
-        name, steps, episodes = str(facts["name"]), len(arrays["rewards"]), len(arrays["lengths"])
-        rows = {"actions": steps, "terminations": steps, "truncations": steps, "observations": steps + episodes}
-        for key, expected in rows.items():
-            if len(arrays[key]) != expected:
-                raise DataError(f"data set '{name}', {key}: got {len(arrays[key])} rows, expected {expected}")
-        if arrays["lengths"].sum() != steps:
-            raise DataError(f"data set '{name}', lengths: they add up to {arrays['lengths'].sum()}, expected {steps}")
+        name = str(facts["name"])
+        validate_arrays(name, arrays)
         trajectories = cls(name=name, **arrays)
         if verify and trajectories.fingerprint() != facts["fingerprint"]:
             raise DataError(

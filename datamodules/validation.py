@@ -18,6 +18,9 @@ FIELDS = ("observations", "actions", "rewards", "terminations", "truncations")
 BOX_TOLERANCE = 1e-5
 """Actions may exceed their box by this much (rounding); they are clipped to it."""
 
+SLICE = 2**20
+"""Rows of a stored array that are checked at a time."""
+
 
 class DataError(UserError):
     """A data set that cannot be used as it is."""
@@ -151,6 +154,70 @@ def in_box(
             f"{where}: got {actions[t, j]:g} at {unit} {first + t}, column {j}, expected {low[j]:g} to {high[j]:g}"
         )
     return np.clip(actions, low, high)
+
+
+def check_box(where: str, low: NDArray[np.float32], high: NDArray[np.float32]) -> None:
+    """Refuse bounds of actions, each (A,), that are not finite or the wrong way round.
+
+    Raises:
+        DataError: Names the first column where they are.
+    """
+    wrong = np.flatnonzero(~(np.isfinite(low) & np.isfinite(high) & (low < high)))
+    if len(wrong):
+        j = int(wrong[0])
+        raise DataError(
+            f"{where}, action_low and action_high: got {low[j]:g} and {high[j]:g} in column {j}, expected finite "
+            "bounds, the lower one below"
+        )
+
+
+def validate_arrays(dataset: str, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Check all episodes of a data set that is stored as flat arrays, a slice at a time.
+
+    Args:
+        dataset: Name of the data set, for messages.
+        arrays: The arrays of a `Trajectories`, of its types.
+
+    Raises:
+        DataError: At the first problem; see `validate_episode`.
+    """
+    where, lengths = f"data set '{dataset}'", arrays["lengths"]
+    low, high = arrays["action_low"], arrays["action_high"]
+    steps = len(arrays["rewards"]) if arrays["rewards"].ndim else 0
+    if lengths.ndim != 1 or not len(lengths) or lengths.min() < 1 or lengths.max() > steps:
+        raise DataError(f"{where}, lengths: got shape {lengths.shape}, expected some numbers of 1 to {steps} steps")
+    if lengths.sum() != steps:
+        raise DataError(f"{where}, lengths: they add up to {lengths.sum()}, expected {steps}")
+    rows = {"observations": steps + len(lengths), "actions": steps}
+    rows |= dict.fromkeys(("rewards", "terminations", "truncations"), steps)
+    for name, expected in rows.items():
+        shape, wide = arrays[name].shape, name in ("observations", "actions")
+        if len(shape) != 1 + wide or shape[0] != expected or 0 in shape:
+            told = f"({expected}, width)" if wide else f"({expected},)"
+            raise DataError(f"{where}, {name}: got shape {shape}, expected {told}")
+    if low.shape != high.shape or low.shape != arrays["actions"].shape[1:]:
+        raise DataError(f"{where}, action_low: got {low.shape} and {high.shape}, expected one bound a column")
+    check_box(where, low, high)
+    for name, expected in rows.items():
+        for first in range(0, expected, SLICE):
+            part = arrays[name][first : first + SLICE]
+            if part.dtype == np.bool_:
+                if part.view(np.uint8).max() > 1:
+                    raise DataError(f"{where}, {name}: got a byte {part.view(np.uint8).max()}, expected 0 or 1")
+                continue
+            finite(f"{where}, {name}", part, first=first, unit="row")
+            if name == "actions":
+                in_box(f"{where}, actions", part, low, high, first=first)
+    last = np.cumsum(lengths) - 1
+    ended = arrays["terminations"] | arrays["truncations"]
+    early = np.setdiff1d(np.flatnonzero(ended), last, assume_unique=True)
+    if len(early):
+        raise DataError(f"{where}: an end at step {early[0]}, inside an episode; expected ends on last steps only")
+    if not ended[last].all():
+        number = int(np.flatnonzero(~ended[last])[0])
+        raise DataError(
+            f"{where}, episode {number}: never ends: terminations and truncations are False on its last step"
+        )
 
 
 def _check_ends(where: str, arrays: dict[str, NDArray[Any]]) -> None:

@@ -84,9 +84,9 @@ class DDSAgent(nn.Module):
             raise UserError("the skill model's bottleneck is gaussian: an agent needs discrete skills (vq)")
         if self.selection not in choices:
             raise UserError(f"selection is '{self.selection}', expected one of {', '.join(choices)}")
-        if self.temperature <= 0:
+        if not 0 < self.temperature < np.inf:
             raise UserError(f"temperature is {self.temperature}, expected more than 0 ('greedy' is the limit)")
-        if self._noise_scale is not None and self._noise_scale < 0:
+        if self._noise_scale is not None and not 0 <= self._noise_scale < np.inf:
             raise UserError(f"noise_scale is {self._noise_scale}, expected 0 or more")
         if self.policy is None and self.selection not in ("random", "fixed"):
             raise UserError(f"selection '{self.selection}' needs a policy; use 'random' or 'fixed' without")
@@ -338,8 +338,7 @@ class DDSAgent(nn.Module):
         published = load_published(directory)
         skill = published.module(SkillModule, "skill")
         policy = published.module(PolicyModule, "policy") if "policy" in published.config else None
-        acting = published.config.get("agent") or {"selection": "random" if policy is None else "sample"}
-        acting = {**acting, **settings}
+        acting = {**published.acting(), **settings}
         if acting["selection"] != "fixed":
             acting.pop("fixed_codes", None)
         try:

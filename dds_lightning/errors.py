@@ -1,17 +1,51 @@
 """The one exception that means: the user can mend this; and how other errors are told."""
 
 import re
+import unicodedata
 
 OUT_OF_MEMORY = ("out of memory", "can't allocate memory", "not enough memory", "ALLOC_FAILED")
 """What accelerators, the allocators of torch on Linux and Windows, and cuBLAS say."""
+
+
+LONGEST = 1100
+"""Characters of a message; of a longer one, which quotes something without end, beginning and end are kept."""
+
+
+def printable(text: str) -> str:
+    """Replace what a terminal acts on, escape sequences and changes of the direction of writing, by its code."""
+    return "".join(
+        character if character in "\n\t" or unicodedata.category(character)[0] != "C" else _code(character)
+        for character in text
+    )
+
+
+def _code(character: str) -> str:
+    return ascii(character)[1:-1]
 
 
 class UserError(ValueError):
     """A mistake in a flag, a file or a setting that the user can mend.
 
     The message names the field, the value found, what was expected and what to do. The command line prints it
-    without a traceback and exits with status 2.
+    without a traceback and exits with status 2. What a terminal would act on is shown as `printable` shows it: messages
+    quote names from files of strangers.
     """
+
+    def __init__(self, message: object = "") -> None:
+        text = printable(str(message))
+        super().__init__(text if len(text) <= LONGEST else f"{text[:700]} ... {text[-300:]}")
+
+
+def lacks_extra(what: str, extra: str) -> UserError:
+    """The error of a package that is not installed.
+
+    It names the checkout and no package of an index: under the name of this project anybody could put one there.
+
+    Args:
+        what: What needs which package, as the sentence begins.
+        extra: The extra of this project that brings it.
+    """
+    return UserError(f"{what}: run `pip install -e '.[{extra}]'` in the folder of this project's checkout")
 
 
 def is_out_of_memory(error: BaseException) -> bool:

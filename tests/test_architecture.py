@@ -21,12 +21,12 @@ ROOMS = {
     "dds_lightning._version": "",
     "dds_lightning.errors": "",
     "dds_lightning.losses": "",
-    "dds_lightning.configs": "errors",
     "dds_lightning.saving": "_version errors",
+    "dds_lightning.configs": "errors saving",
     "dds_lightning.console": "errors",
     "dds_lightning.nn": "errors losses",
     "dds_lightning.envs": "errors",
-    "dds_lightning.tasks": "errors envs",
+    "dds_lightning.tasks": "envs errors saving",
     # the method, to be read in this order
     "dds_lightning.finetune": "errors saving",
     "dds_lightning.module": "errors finetune nn saving",
@@ -49,7 +49,7 @@ ROOMS = {
     "datamodules.collect",
     "datamodules.inspection": "tasks datamodules.sources datamodules.trajectories",
     "datamodules.listing": "errors tasks datamodules.sources datamodules.storage datamodules.trajectories",
-    "datamodules.partial_codes": "saving",
+    "datamodules.partial_codes": "errors saving",
     "datamodules.relabelling": "errors tasks",
     "datamodules.relabel": "console errors saving skill datamodules.partial_codes datamodules.relabelling "
     "datamodules.trajectories",

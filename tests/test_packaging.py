@@ -25,6 +25,14 @@ def _pins(file="constraints.txt"):
     return dict(line.split("==") for line in lines if line and not line.startswith("#"))
 
 
+def _sources():
+    return [path for folder in ("dds_lightning", "datamodules") for path in (ROOT / folder).rglob("*.py")]
+
+
+def _sources():
+    return [path for folder in ("dds_lightning", "datamodules") for path in (ROOT / folder).rglob("*.py")]
+
+
 def _requirements():
     groups = [PROJECT["dependencies"], *PROJECT["optional-dependencies"].values()]
     return [re.match(r"[\w-]+", line)[0].lower() for group in groups for line in group]
@@ -69,6 +77,20 @@ def test_every_module_imports():
             except (ModuleNotFoundError, UserError) as error:
                 if "stable-baselines3" not in str(error).replace("_", "-"):  # of the extra `behaviours`
                     raise
+
+
+def test_nobody_is_told_to_install_this_project_from_an_index():
+    """Nobody owns its name there: a stranger could put anything under it. The checkout is named instead."""
+    texts = [*ROOT.glob("*.md"), *(ROOT / "notebooks").glob("*.py"), *(ROOT / "checkpoints").rglob("*.md"), *_sources()]
+    told = [line for path in texts for line in path.read_text(encoding="utf-8").splitlines() if "pip install" in line]
+    assert len(told) >= 3
+    assert [line for line in told if not re.search(r"pip install -e '?\.", line)] == []
+
+
+def test_every_extra_that_a_message_names_exists():
+    source = "".join(path.read_text(encoding="utf-8") for path in _sources())
+    named = set(re.findall(r'lacks_extra\(.*, "(\w+)"\)', source))
+    assert {"hub", "export", "behaviours"} <= named <= set(PROJECT["optional-dependencies"])
 
 
 def test_versions_known_to_be_bad_are_excluded():

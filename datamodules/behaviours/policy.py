@@ -15,7 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from datamodules.validation import DataError
+from dds_lightning.errors import UserError
+from dds_lightning.saving.arrays import read_tensors
 from dds_lightning.saving.files import written_whole
+from dds_lightning.saving.untrusted import mapping, parse_json
 
 FORMAT = "1"
 OBSERVATION_CLIP = 10.0
@@ -100,15 +103,11 @@ class MLPPolicy:
         Raises:
             DataError: The file is missing, damaged or not a behaviour policy.
         """
-        from safetensors import SafetensorError, safe_open
-
         path = Path(path).expanduser()
         try:
-            with safe_open(path, framework="numpy") as file:
-                header = file.metadata() or {}
-                arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a mapping
-            metadata = json.loads(header.get("metadata", "{}"))
-        except (OSError, SafetensorError, ValueError) as error:
+            arrays, header = read_tensors(path, "numpy")
+            metadata = mapping(parse_json(header.get("metadata", "{}"), path), path)
+        except UserError as error:
             raise DataError(
                 f"behaviour policy {path}: missing or damaged ({error}); train or fetch it again"
             ) from error

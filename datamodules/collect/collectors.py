@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import json
 import shlex
 from collections.abc import Mapping
 from dataclasses import fields
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dds_lightning.errors import UserError
+from dds_lightning.saving.untrusted import mapping, read_json
 from dds_lightning.tasks import Task, get_task, known_task
 
 if TYPE_CHECKING:
@@ -101,9 +101,9 @@ def collection_command(folder: str | Path) -> str | None:
         folder: Of the data set, as in `local:FOLDER`.
     """
     try:
-        made = json.loads((Path(folder) / "data" / "metadata.json").read_text(encoding="utf-8"))["collection"]
+        made = mapping(read_json(Path(folder) / "data" / "metadata.json"), folder)["collection"]
         task, steps, seed = known_task(str(made["task"])), int(made["steps"]), int(made["seed"])
-    except (OSError, ValueError, KeyError, TypeError, UserError):
+    except (ValueError, KeyError, TypeError, OverflowError):
         return None
     collector = collector_of(task)
     if collector is None:

@@ -18,6 +18,7 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from datamodules.storage import refuse_existing
+from dds_lightning.saving.arrays import create_h5
 from dds_lightning.saving.files import folder_written_whole
 
 Episode = Mapping[str, Any]
@@ -88,7 +89,7 @@ def write_minari(
 
 def _write_episodes(path: Path, episodes: Iterable[Episode]) -> tuple[int, int]:
     count = steps = 0
-    with h5py.File(path, "w", libver="v110") as file:
+    with create_h5(path) as file:
         for count, episode in enumerate(episodes, start=1):
             group = file.create_group(f"episode_{count - 1}")
             length = len(episode["rewards"])

@@ -15,7 +15,6 @@ import hashlib
 import json
 import multiprocessing
 import os
-import shutil
 import signal
 import sys
 from collections.abc import Iterable, Iterator, Mapping
@@ -27,7 +26,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from dds_lightning.errors import UserError
+from dds_lightning.saving.arrays import read_npz
 from dds_lightning.saving.files import written_whole
+from dds_lightning.saving.untrusted import read_text, remove_tree
 
 Episode = dict[str, Any]
 
@@ -93,8 +94,8 @@ class PartialRecording:
     def open(self) -> None:
         """Create the folder; chunks of other settings are deleted."""
         note = self.folder / "settings"
-        if not note.is_file() or note.read_text(encoding="utf-8") != self.key:
-            shutil.rmtree(self.folder, ignore_errors=True)
+        if not note.is_file() or read_text(note) != self.key:
+            self.remove()
             self.folder.mkdir(parents=True)
             note.write_text(self.key, encoding="utf-8")
 
@@ -111,18 +112,17 @@ class PartialRecording:
     def read(self, first: int) -> list[Episode]:
         """The episodes of the chunk that begins with round `first`."""
         episodes: dict[int, Episode] = {}
-        with np.load(self._path(first), allow_pickle=False) as stored:
-            for key in stored.files:
-                number, *path, name = key.split("/")
-                fields = episodes.setdefault(int(number), {})
-                for step in path:
-                    fields = fields.setdefault(step, {})
-                fields[name] = stored[key]
+        for key, array in read_npz(self._path(first), remedy=f"delete {self.folder} and collect again").items():
+            number, *path, name = key.split("/")
+            fields = episodes.setdefault(int(number), {})
+            for step in path:
+                fields = fields.setdefault(step, {})
+            fields[name] = array
         return [episodes[number] for number in sorted(episodes)]
 
     def remove(self) -> None:
         """Delete the chunks once the data set is complete."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+        remove_tree(self.folder, self.folder.parent)
 
     def _path(self, first: int) -> Path:
         return self.folder / f"{first:06d}.npz"

@@ -10,20 +10,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from datamodules.sources.plausibility import refuse_other_task
 from datamodules.sources.source import Recording, Source, check_width
 from datamodules.trajectories import Trajectories
+from datamodules.validation import SLICE, in_box
 from dds_lightning.tasks import Task
 
 
 def load_arrays(directory: str, task: Task | None) -> Trajectories:
-    """Map a folder of arrays and check that their widths fit `task`.
+    """Map a folder of arrays and check that widths, actions and observations fit `task`.
 
     Raises:
-        DataError: When a file is damaged or a width is another task's.
+        DataError: When a file is damaged, or the data are another task's.
     """
     trajectories = Trajectories.load(directory, mmap=True)
     where = f"data set '{trajectories.name}'"
     check_width(where, task, trajectories.observation_dim, trajectories.action_dim)
+    if task is not None:
+        low = np.full(trajectories.action_dim, task.action_low, np.float32)
+        high = np.full(trajectories.action_dim, task.action_high, np.float32)
+        for first in range(0, trajectories.num_steps, SLICE):
+            in_box(f"{where}, actions", trajectories.actions[first : first + SLICE], low, high, first=first)
+        refuse_other_task(where, trajectories.observations, task)
     return trajectories
 
 

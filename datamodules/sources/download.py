@@ -24,6 +24,7 @@ from typing import Any, BinaryIO, NoReturn
 
 from dds_lightning.errors import UserError
 from dds_lightning.saving.files import sync
+from dds_lightning.saving.untrusted import read_json
 
 ATTEMPTS = 5
 """Attempts in a row; each continues where the one before was cut off."""
@@ -152,8 +153,8 @@ class _Download:
 
     def _known(self) -> dict[str, Any]:
         """Description of what has arrived; empty if it came from another address."""
-        with contextlib.suppress(OSError, ValueError):
-            facts = json.loads(self.facts.read_text(encoding="utf-8"))
+        with contextlib.suppress(UserError):
+            facts = read_json(self.facts)
             if isinstance(facts, dict) and facts.get("url") == self.url and isinstance(facts.get("size"), int):
                 return facts
         return {}

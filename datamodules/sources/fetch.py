@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from pathlib import Path
 from urllib.parse import quote
 
@@ -11,6 +10,7 @@ from datamodules.sources.download import download
 from datamodules.validation import DataError
 from dds_lightning.errors import UserError
 from dds_lightning.saving.files import neighbours
+from dds_lightning.saving.untrusted import remove_tree
 from dds_lightning.tasks import Task, get_task, task_names
 from dds_lightning.tasks.bodies import body_of
 
@@ -84,7 +84,7 @@ def fetch_minari(dataset_id: str, root: str | Path | None = None) -> Path:
     try:
         read_metadata(partial / "data")
     except DataError:
-        shutil.rmtree(partial, ignore_errors=True)
+        remove_tree(partial, partial.parent)
         raise
     download(f"{address}/main_data.hdf5", partial / "data" / "main_data.hdf5")
     os.replace(partial, folder)

@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.validation import DataError
+from dds_lightning.errors import UserError
+from dds_lightning.saving.arrays import open_h5
 from dds_lightning.saving.files import neighbours
 
 FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32", 5: "n-bit", 6: "scale-offset", 32000: "lzf"}
@@ -37,20 +39,23 @@ _DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError
 
 
 @contextlib.contextmanager
-def open_hdf5(path: Path, where: str) -> Iterator[h5py.File]:
+def open_hdf5(path: Path, where: str, root: Path | None = None) -> Iterator[h5py.File]:
     """Open a file for reading; what HDF5 raises inside the block becomes a DataError that names it.
 
     Args:
         path: The file.
         where: The data set, as messages begin.
+        root: The folder that it must lie in, links followed; None accepts any place.
 
     Raises:
-        DataError: When the file is missing, damaged or not HDF5.
+        DataError: When the file is missing, damaged, not HDF5, or a link out of `root`.
     """
     if not path.is_file():
         raise DataError(f"{where}: {path} is {'a folder' if path.is_dir() else 'missing'}{neighbours(path)}")
     try:
-        file = h5py.File(path, "r")
+        file = open_h5(path, root)
+    except UserError as error:
+        raise DataError(f"{where}: {error}") from error
     except _DAMAGE as error:
         kind = "" if h5py.is_hdf5(path) else ", or not an HDF5 file at all"
         raise DataError(f"{where}: {path} is truncated or damaged{kind} ({error})") from error

@@ -26,7 +26,9 @@ from numpy.typing import NDArray
 from datamodules.sources.observations import Layout, box_shape, describe_space, find_layout, task_layout
 from datamodules.validation import DataError
 from dds_lightning.envs.kitchen import SUBTASKS
+from dds_lightning.errors import UserError
 from dds_lightning.saving.files import neighbours
+from dds_lightning.saving.untrusted import parse_json, read_text
 from dds_lightning.tasks import Task, known_env_ids
 
 MAX_BYTES = 2**20
@@ -66,12 +68,10 @@ def read_metadata(data: Path) -> dict[str, Any]:
     path = data / "metadata.json"
     if not path.is_file():
         raise DataError(f"data: {path} is missing, so {data} is not a Minari data set{neighbours(path)}")
-    if path.stat().st_size > MAX_BYTES:
-        raise DataError(f"data: {path} has {path.stat().st_size:,} bytes, expected at most {MAX_BYTES:,}")
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, ValueError) as error:
-        raise DataError(f"data: {path} is damaged ({_short(error)})") from error
+        text = read_text(path, MAX_BYTES, root=data, verdict="is damaged")
+    except UserError as error:
+        raise DataError(f"data: {error}") from error
     metadata = _parse(text, f"data: {path}")
     name = _name(metadata, data)
     for key in ("observation_space", "action_space"):
@@ -97,8 +97,8 @@ def read_metadata(data: Path) -> dict[str, Any]:
 def _parse(text: Any, where: str) -> dict[str, Any]:
     """A JSON object."""
     try:
-        value = json.loads(text)
-    except (ValueError, TypeError, RecursionError) as error:
+        value = parse_json(text, "it")
+    except UserError as error:
         raise DataError(f"{where} is damaged: it is not a JSON object ({_short(error)})") from error
     if not isinstance(value, dict):
         raise DataError(f"{where} is damaged: expected a JSON object, got {_short(value)}")

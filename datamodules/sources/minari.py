@@ -128,7 +128,7 @@ class _Reader:
         Returns:
             Lengths (E,), and the arrays of all episodes end to end, as in `Trajectories`.
         """
-        with open_hdf5(self.path, f"data set '{self.name}'") as file:
+        with open_hdf5(self.path, f"data set '{self.name}'", self.path.parent) as file:
             names = set(file)  # asking the file for a single name would follow links
             labels = [f"episode_{number}" for number in range(len(names))]
             self._check_promise("episodes", episodes, len(labels))
@@ -248,7 +248,7 @@ def open_local(directory: str | Path, task: Task, rng: np.random.Generator) -> I
     data = data_folder(directory)
     metadata = read_metadata(data)
     check_task(metadata, task)
-    with open_hdf5(data / "main_data.hdf5", f"data set '{metadata['dataset_id']}'") as file:
+    with open_hdf5(data / "main_data.hdf5", f"data set '{metadata['dataset_id']}'", data) as file:
         yield _MinariRows(file, metadata, task, rng)
 
 

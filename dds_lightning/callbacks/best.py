@@ -1,9 +1,11 @@
 """The checkpoint with the best value of a metric."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Literal
 
 import lightning.pytorch as pl
+import torch
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 
 
@@ -46,6 +48,25 @@ class BestCheckpoint(ModelCheckpoint):
             save_on_train_epoch_end=False,  # but after validation, so that `RollingCheckpoint` saves its state
         )
         self.every_n_steps = every_n_steps
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on from the best so far: its score comes from the state, its place never does.
+
+        Lightning would take the paths of the state as they are, and delete the file or folder that they name when a
+        better checkpoint comes.
+        """
+        score = state_dict.get("best_model_score")
+        own = Path(str(self.dirpath), f"{self.filename}{self.FILE_EXTENSION}")
+        if not isinstance(score, torch.Tensor) or score.numel() != 1 or not own.is_file():
+            return  # nothing to compare with: the first look finds the best so far
+        if state_dict.get("dirpath", self.dirpath) != self.dirpath:
+            return  # what was best lies elsewhere
+        self.best_k_models = {str(own): score}
+        self.best_model_path = self.kth_best_model_path = str(own)
+        self.best_model_score = self.kth_value = score
+
+    def _remove_checkpoint(self, trainer: pl.Trainer, filepath: str) -> None:
+        """Delete nothing: the best checkpoint always has the same name, so a better one replaces it."""
 
     def on_train_batch_end(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int

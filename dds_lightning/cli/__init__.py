@@ -14,7 +14,7 @@ from typing import Any
 
 from dds_lightning._version import __version__
 from dds_lightning.console.interrupts import Interrupted, caught
-from dds_lightning.errors import UserError, is_out_of_memory, reason
+from dds_lightning.errors import UserError, is_out_of_memory, printable, reason
 from dds_lightning.saving.files import DISK_ERRORS
 from dds_lightning.training.stages import STAGES
 
@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         return _complain(f"out of memory ({reason(error)}): ask for less at once, for example with fewer --workers")
     except Interrupted as stop:
-        print(f"dds: {_interrupted(arguments, stop)}", file=sys.stderr)
+        print(f"dds: {printable(_interrupted(arguments, stop))}", file=sys.stderr)
         return int(stop.code or 1)
     except BrokenPipeError:
         # The reader has left (`dds tasks | head`); Python would complain again while closing standard output.
@@ -119,11 +119,11 @@ def _report(work: Callable[[], Any], as_json: bool) -> int:
 
 def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
     """Print a warning as one sentence: where in the code it was raised means nothing to the user of a command."""
-    print(f"dds: warning: {' '.join(str(message).split())}", file=sys.stderr)
+    print(f"dds: warning: {' '.join(printable(str(message)).split())}", file=sys.stderr)
 
 
 def _complain(message: str) -> int:
-    print(f"dds: error: {' '.join(message.split())}", file=sys.stderr)
+    print(f"dds: error: {' '.join(printable(message).split())}", file=sys.stderr)
     return USAGE_ERROR
 
 

@@ -35,6 +35,7 @@ def publish(
     from dds_lightning.agent import DDSAgent
     from dds_lightning.saving.hub import is_hub, push
     from dds_lightning.saving.published import CARD, load_published
+    from dds_lightning.saving.untrusted import read_text
     from dds_lightning.sharing.verify import verify_published
     from dds_lightning.study.card import with_diagnosis
     from dds_lightning.study.contestants import agent_directory
@@ -60,7 +61,7 @@ def publish(
         chosen = chosen or restore_task(published.config, source)
         about, metrics = {"task": None} if chosen is None else facts_to_keep(chosen), dict(published.metrics)
         if text is None:
-            text = (source / CARD).read_text(encoding="utf-8")
+            text = read_text(source / CARD)
             if (Path(run) / "report").is_dir():
                 text = with_diagnosis(text, Path(run))
     if is_hub(place):

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from dds_lightning.errors import UserError
+from dds_lightning.saving.untrusted import read_yaml
 
 ROOT = Path(__file__).parent
 RUN_DEFAULTS: dict[str, Any] = {
@@ -49,10 +48,7 @@ def run_defaults(name: str) -> dict[str, Any]:
         UserError: There is no such preset, or its `run.yaml` is not a mapping of these settings.
     """
     path = preset_folder(name) / "run.yaml"
-    try:
-        chosen = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UserError(f"preset: {path} is not valid YAML: {' '.join(str(error).split())}") from error
+    chosen = read_yaml(path, verdict="is not valid YAML", remedy="mend it") if path.is_file() else {}
     known = ", ".join(RUN_DEFAULTS)
     if not isinstance(chosen, dict):
         raise UserError(f"preset: {path} is not a mapping, expected some of {known}")

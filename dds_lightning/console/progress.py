@@ -8,7 +8,8 @@ from functools import partial
 from typing import Any, TypeVar
 
 from rich import progress as bars
-from rich.console import Console
+
+from dds_lightning.console.terminal import Terminal
 
 T = TypeVar("T")
 
@@ -27,7 +28,7 @@ COLUMNS: dict[str, Callable[[], bars.ProgressColumn]] = {
 
 def on_terminal() -> bool:
     """Whether standard error is a terminal."""
-    return Console(stderr=True).is_terminal
+    return Terminal(stderr=True).is_terminal
 
 
 @contextmanager
@@ -38,7 +39,7 @@ def progress_bar(
     *,
     shown: bool = True,
     transient: bool = True,
-    console: Console | None = None,
+    console: Terminal | None = None,
     **fields: Any,
 ) -> Iterator[Callable[..., None]]:
     """Show a bar on standard error while the block runs.
@@ -60,8 +61,8 @@ def progress_bar(
     if not shown:  # not rich's `disable`: in rich 13.7 that writes an empty line
         yield lambda **changes: None
         return
-    columns = [COLUMNS[name]() if name in COLUMNS else bars.TextColumn(name) for name in layout]
-    console = console or Console(stderr=True)
+    columns = [COLUMNS[name]() if name in COLUMNS else bars.TextColumn(name, markup=False) for name in layout]
+    console = console or Terminal(stderr=True)
     with bars.Progress(*columns, console=console, transient=transient) as progress:
         yield partial(progress.update, progress.add_task(description, total=total, **fields))
 
@@ -91,8 +92,8 @@ def announcements(total: int) -> Iterator[Callable[[str], None]]:
     Yields:
         A function that takes the next announcement.
     """
-    notebook = Console().is_jupyter  # plain lines are what a notebook can show, whatever its streams claim to be
-    console = Console(stderr=True, force_jupyter=False, force_terminal=False if notebook else None)
+    notebook = Terminal().is_jupyter  # plain lines are what a notebook can show, whatever its streams claim to be
+    console = Terminal(stderr=True, force_jupyter=False, force_terminal=False if notebook else None)
     shown = console.is_terminal
     with progress_bar(
         ("spinner", "bar", "{task.description}", "elapsed"), total, shown=shown, console=console
@@ -101,6 +102,6 @@ def announcements(total: int) -> Iterator[Callable[[str], None]]:
         def announce(text: str) -> None:
             update(advance=1, description=text)
             if not shown:
-                console.print(text, highlight=False)
+                console.print(text)
 
         yield announce

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dds_lightning.errors import printable
+
 if TYPE_CHECKING:
     import pandas as pd
     from rich.console import RenderableType
@@ -33,12 +35,12 @@ class Report:
         if as_json:
             print(json.dumps(plain(self.data), indent=2, allow_nan=False))
             return
-        from rich.console import Console
+        from dds_lightning.console.terminal import Terminal
 
         # A pipe has no width: rich would cut a table at 80 columns, and `grep` would miss what was cut.
-        console = Console(soft_wrap=True) if sys.stdout.isatty() else Console(width=200, soft_wrap=True)
+        console = Terminal(soft_wrap=True) if sys.stdout.isatty() else Terminal(width=200, soft_wrap=True)
         for line in self.text:
-            console.print(line, highlight=False, markup=False)
+            console.print(printable(line) if isinstance(line, str) else line)
 
 
 def plain(value: Any) -> Any:
@@ -62,11 +64,13 @@ def pairs(lines: Iterable[tuple[str, Any]], title: str | None = None) -> "Table"
     """Draw names and values in two columns; long values wrap beside their names."""
     from rich.table import Table
 
-    drawn = Table(title=title, title_justify="left", box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
+    drawn = Table(
+        title=_title(title), title_justify="left", box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0)
+    )
     drawn.add_column(no_wrap=True)
     drawn.add_column(overflow="fold")
     for name, value in lines:
-        drawn.add_row(name, str(value))
+        drawn.add_row(printable(name), printable(str(value)))
     return drawn
 
 
@@ -75,10 +79,10 @@ def table(frame: "pd.DataFrame", title: str | None = None, digits: int = 3) -> "
     from rich import box
     from rich.table import Table
 
-    drawn = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    drawn = Table(title=_title(title), title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for column in frame.columns:
         numeric = frame[column].dtype.kind in "iuf"
-        drawn.add_column(str(column), justify="right" if numeric else "left", overflow="fold")
+        drawn.add_column(printable(str(column)), justify="right" if numeric else "left", overflow="fold")
     for row in frame.itertuples(index=False):
         drawn.add_row(*(_cell(value, digits) for value in row))
     return drawn
@@ -87,4 +91,8 @@ def table(frame: "pd.DataFrame", title: str | None = None, digits: int = 3) -> "
 def _cell(value: Any, digits: int) -> str:
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "-"
-    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
+    return f"{value:.{digits}g}" if isinstance(value, float) else printable(str(value))
+
+
+def _title(text: str | None) -> str | None:
+    return None if text is None else printable(text)

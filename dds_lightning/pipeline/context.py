@@ -4,8 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
+from dds_lightning.console.terminal import Terminal
 from dds_lightning.errors import UserError
 from dds_lightning.pipeline.settings import RunSettings, Trainings
 from dds_lightning.saving.run_directory import Done
@@ -43,7 +42,7 @@ class Run:
                 raise UserError(f"--{name} is {value}, expected at least 1")
         self.data_hash = self._look_at_data()
         self.trainings: Trainings = Trainings(settings, self.task)
-        self.console = Console(stderr=True)
+        self.console = Terminal(stderr=True)
         self.done: dict[str, Done] = {}
 
     def _look_at_data(self) -> str | None:
@@ -83,4 +82,4 @@ class Run:
 
     def say(self, text: str, style: str | None = None) -> None:
         """Tell the person at the terminal."""
-        self.console.print(text, style=style, highlight=False, soft_wrap=True)
+        self.console.print(text, style=style, soft_wrap=True)

@@ -3,6 +3,7 @@
 The trainings are the very commands `dds skill fit`, `dds policy fit` and `dds clone fit`, which are printed.
 """
 
+from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
@@ -10,7 +11,8 @@ from dds_lightning.console.reports import Report
 from dds_lightning.pipeline.context import Run
 from dds_lightning.pipeline.settings import RunSettings
 from dds_lightning.pipeline.steps import STEPS
-from dds_lightning.saving.run_directory import RunDirectory, duration, locked
+from dds_lightning.saving.run_directory import MARKER, RunDirectory, duration, locked
+from dds_lightning.saving.untrusted import parsing
 from dds_lightning.study.run_task import keep_task
 
 
@@ -58,7 +60,10 @@ def _report(run: Run) -> Report:
         from dds_lightning.study.report import summary_lines
 
         data |= run.facts("report")
-        text += summary_lines(run.facts("report"))
+        # Of a report that was there before, the marker may be a stranger's.
+        marker, remedy = run.done["report"].folder / MARKER, "delete it, and `dds run` reports again"
+        with parsing(marker, remedy) if run.done["report"].skipped else nullcontext():
+            text += summary_lines(run.facts("report"))
         shown = [run.done["report"]]
         text.append(f"agent: {run.output('evaluate', 'agent')}")
     text += [f"{name}: {path}" for step in shown for name, path in step.outputs.items()]

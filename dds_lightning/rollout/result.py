@@ -12,9 +12,25 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from dds_lightning.errors import UserError
+from dds_lightning.saving.arrays import read_npz, read_parquet
 from dds_lightning.saving.files import written_whole
+from dds_lightning.saving.untrusted import parsing, safe_name
 
 _EPISODES, _PATHS = "episodes.parquet", "paths.npz"
+_COLUMNS = {
+    **dict.fromkeys(("actor", "label"), "O"),
+    **dict.fromkeys(("episode", "seed"), "iu"),
+    **dict.fromkeys(("return", "score"), "f"),
+    **dict.fromkeys(("success", "terminated"), "bO"),
+    "length": "iu",
+    **dict.fromkeys(("final_x", "final_y"), "f"),
+    "final_code": "iu",
+    "codes": "O",
+}
+"""Column -> kinds of NumPy that it may have."""
+_REMEDY = "run the rollout again; in a run, delete the folder evaluate and `dds run` plays the episodes anew"
+_MOST = 2**12
+"""Codes that a table may name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,17 +127,23 @@ class RolloutResult:
         """
         directory = Path(directory)
         file = directory / _EPISODES
-        if not file.is_file():
+        if not file.exists():
             raise UserError(f"{file} does not exist: expected a directory written by a rollout")
-        table = pd.read_parquet(file)
-        table["codes"] = [list(map(int, codes)) for codes in table["codes"]]
+        table = read_parquet(file, _COLUMNS, _REMEDY, root=directory)
+        with parsing(file, _REMEDY):
+            _check_episodes(table)
         paths: dict[tuple[str, int], RolloutPath] = {}
-        if (directory / _PATHS).is_file():
-            with np.load(directory / _PATHS, allow_pickle=False) as stored:
-                arrays = {name: stored[name] for name in stored.files}
+        if (directory / _PATHS).exists():
+            arrays = read_npz(directory / _PATHS, root=directory, remedy=_REMEDY)
             lengths = table["length"].to_numpy()
-            if len(arrays["codes"]) != lengths.sum() or len(arrays["positions"]) != (lengths + 1).sum():
-                raise UserError(f"{directory / _PATHS} does not belong to {file}: run the rollout again")
+            steps = int(lengths.sum())
+            forms = {"codes": ((steps,), "iu"), "positions": ((steps + len(lengths), 2), "f")}
+            forms |= {"observations": ((steps + len(lengths), -1), "f")} if "observations" in arrays else {}
+            for name, (shape, kinds) in forms.items():
+                array = arrays.get(name, np.zeros(0))
+                width = array.shape[1:] if shape[-1] == -1 else shape[1:]
+                if array.shape != (shape[0], *width) or array.ndim != len(shape) or array.dtype.kind not in kinds:
+                    raise UserError(f"{directory / _PATHS}: {name} do not belong to {file}: {_REMEDY}")
             step = state = 0
             for actor, episode, length in zip(table["actor"], table["episode"], lengths, strict=True):
                 states = slice(state, state + length + 1)
@@ -129,4 +151,40 @@ class RolloutResult:
                 codes = arrays["codes"][step : step + length]
                 paths[actor, int(episode)] = RolloutPath(arrays["positions"][states], codes, seen)
                 step, state = step + length, state + length + 1
-        return cls(str(table.attrs.get("task", "")), table, paths)
+        return cls(safe_name(table.attrs.get("task", "")), table, paths)
+
+
+def _check_episodes(table: pd.DataFrame) -> None:
+    """Make the columns what `RolloutResult` says, in place; a table that cannot be is refused.
+
+    Raises:
+        ValueError: Says what is wrong.
+    """
+    if not len(table):
+        raise ValueError("it has no episodes")
+    for name in ("actor", "label"):
+        if not all(isinstance(text, str) for text in table[name]):
+            raise ValueError(f"column '{name}' holds more than texts")
+        distinct = table[name].nunique()
+        table[name] = [safe_name(text) for text in table[name]]
+        if table[name].nunique() != distinct or "" in table[name].to_numpy():
+            raise ValueError(f"column '{name}' holds names that are not text")
+    table["codes"] = [list(map(int, codes)) for codes in table["codes"]]
+    used = [code for codes in table["codes"] for code in codes]
+    ranges = {"length": (1, 10**7), "episode": (0, 10**7), "final_code": (-1, _MOST - 1)}
+    for name, (low, high) in ranges.items():
+        if table[name].min() < low or table[name].max() > high:
+            raise ValueError(f"column '{name}' runs from {table[name].min()} to {table[name].max()}")
+    if used and not 0 <= min(used) <= max(used) < _MOST:
+        raise ValueError(f"column 'codes' runs from {min(used)} to {max(used)}")
+    if not np.isfinite(table[["return", "score"]].to_numpy()).all():
+        raise ValueError("a return or score is not finite")
+    if np.nanmax(np.abs(table[["final_x", "final_y"]].to_numpy()), initial=0.0) > 1e6:
+        raise ValueError("an episode ended beyond a thousand kilometres")
+    for name in ("success", "terminated"):
+        if not all(flag is pd.NA or flag is None or isinstance(flag, (bool, np.bool_)) for flag in table[name]):
+            raise ValueError(f"column '{name}' holds more than flags")
+    if table.duplicated(["actor", "episode"]).any():
+        raise ValueError("an episode is there twice")
+    if not isinstance(table.attrs.get("task", ""), str):
+        raise ValueError("its task is no text")

@@ -8,8 +8,10 @@ from __future__ import annotations
 import errno
 import os
 import pickle
+import pickletools
+import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,11 +19,14 @@ import torch
 from lightning.fabric.plugins import TorchCheckpointIO
 from torch import nn
 
-from dds_lightning.errors import UserError
+from dds_lightning.errors import UserError, reason
+from dds_lightning.saving.arrays import check_archive
+from dds_lightning.saving.build import build_module
 from dds_lightning.saving.files import neighbours, refuse_newer, written_whole
 from dds_lightning.saving.published import Published as Published
-from dds_lightning.saving.published import build_module, load_published
+from dds_lightning.saving.published import load_published
 from dds_lightning.saving.published import publish as publish
+from dds_lightning.saving.untrusted import check_plain, regular_file
 
 FORMAT = 1
 FORMAT_KEY = "dds_format"
@@ -31,6 +36,21 @@ STAGE_KEY = "stage"
 """Entry of a `.ckpt` that holds the name of the training stage; older files are known by a setting of theirs."""
 _TELLTALES = {"tau": "policy", "horizon": "skill", "action_dim": "clone"}
 
+_ENTRIES: dict[str, type] = {
+    **dict.fromkeys(("hyper_parameters", "callbacks", "loops", "settings"), dict),
+    **dict.fromkeys(("optimizer_states", "lr_schedulers", "rng"), list),
+    **dict.fromkeys(("global_step", "epoch"), int),
+    STAGE_KEY: str,
+}
+"""What Lightning and this project keep in a checkpoint, and as what."""
+_BUILT = re.compile(
+    r"collections OrderedDict|(builtins|__builtin__) (set|complex)|torch (Size|device|\w+Storage|[a-z]\w*)"
+    r"|torch\._utils _rebuild_(tensor_v2|parameter)|torch\.serialization _get_layout"
+)
+"""What a checkpoint may name: containers, and dense tensors of what the file itself holds."""
+VALUES = 2_000_000
+"""Values in a checkpoint, tensors not counted by their numbers."""
+
 M = TypeVar("M", bound=nn.Module)
 
 
@@ -39,8 +59,12 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
     A full disk, a kill or a read-only folder leaves the previous file as it was, and the error is raised.
     Local paths only. The file says which version of the format it has; one that was written on an accelerator loads
-    on a CPU.
+    on a CPU. Only what this process has written is ever deleted.
     """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._written: set[Path] = set()
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | os.PathLike[str], storage_options: Any | None = None
@@ -58,10 +82,11 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         """
         if storage_options is not None:
             raise TypeError("storage_options are for remote storage; checkpoints are written to local paths")
+        self._written.add(Path(path).resolve())
         with written_whole(Path(path)) as part:
             _write({**checkpoint, FORMAT_KEY: FORMAT}, part)
             try:
-                _check_sums(part)
+                check_archive(part, part.stat().st_size)
             except zipfile.BadZipFile as error:
                 told = f"it reads back differently: {error}; the disk may be full or failing"
                 raise OSError(errno.EIO, told) from None
@@ -77,6 +102,17 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         del map_location, weights_only  # a Trainer moves what it loads to its own device
         return load_ckpt(path)
 
+    def remove_checkpoint(self, path: str | os.PathLike[str]) -> None:
+        """Delete a checkpoint that this process has written; anything else stays.
+
+        A `ModelCheckpoint` that goes on takes the paths to delete from the checkpoint's state, where anybody may have
+        put them. Lightning would delete folders too.
+        """
+        place = Path(path)
+        if place.resolve() in self._written and place.is_file() and not place.is_symlink():
+            place.unlink()
+            self._written.discard(place.resolve())
+
 
 def load_ckpt(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Read a `.ckpt` on the CPU, wherever it was written, without running anything that it may contain.
@@ -86,20 +122,59 @@ def load_ckpt(path: str | os.PathLike[str]) -> dict[str, Any]:
             values.
     """
     path = Path(path)
-    if not path.is_file():
+    if not path.exists():
         raise UserError(f"there is no checkpoint {path}{neighbours(path)}")
+    size = regular_file(path)
     try:
-        _check_sums(path)
+        _check_parts(path, size)
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
-        reason = str(error).split("\n", 1)[0]
-        raise UserError(f"{path} is damaged, or holds more than tensors and plain values: {reason}") from None
-    except (RuntimeError, EOFError, OSError, KeyError, ValueError, NotImplementedError, zipfile.BadZipFile) as error:
-        raise UserError(f"{path} is not a readable checkpoint, cut short perhaps: {error}") from None
+        raise UserError(f"{path} is damaged, or holds more than tensors and plain values: {reason(error)}") from None
+    except UserError:
+        raise
+    except Exception as error:  # torch and zipfile raise anything over damaged files
+        told = f"{reason(error)[:200]} ({type(error).__name__})"
+        raise UserError(f"{path} is not a readable checkpoint, cut short perhaps: {told}") from None
     if not isinstance(checkpoint, dict) or not isinstance(checkpoint.get("state_dict"), dict):
         raise UserError(f"{path} is not a Lightning checkpoint: it has no state_dict")
     refuse_newer(path, checkpoint.get(FORMAT_KEY, FORMAT), FORMAT)
+    check_plain(checkpoint, path, VALUES)
+    for name, kind in _ENTRIES.items():
+        if (value := checkpoint.get(name)) is not None and not isinstance(value, kind):
+            raise UserError(f"{path}: '{name}' is a {type(value).__name__}: the file is damaged, take another one")
+    for name, value in checkpoint["state_dict"].items():
+        if not isinstance(name, str) or not isinstance(value, torch.Tensor):
+            raise UserError(f"{path}: '{name}' in state_dict is a {type(value).__name__}, expected a tensor")
+    if (declared := sum(tensor.numel() * tensor.itemsize for tensor in _tensors(checkpoint))) > 4 * size + 2**20:
+        raise UserError(f"{path} declares {declared:,} bytes of tensors, but has only {size:,}")
     return checkpoint
+
+
+def _check_parts(path: Path, size: int) -> None:
+    """Refuse an archive that is damaged, that unpacks to more than it holds, or that names unusual parts to build.
+
+    torch compares no checksums, so a changed byte would load as another weight. And what its own list of harmless
+    callables can build includes any amount of memory.
+
+    Raises:
+        BadZipFile: It is no archive, or damaged.
+        UnpicklingError: It asks for something that no checkpoint of ours holds.
+    """
+    check_archive(path, size)
+    with zipfile.ZipFile(path) as archive:
+        for member in archive.namelist():
+            if member.endswith("data.pkl"):
+                for operation, argument, _ in pickletools.genops(archive.read(member)):
+                    if operation.name == "GLOBAL" and not _BUILT.fullmatch(str(argument)):
+                        raise pickle.UnpicklingError(f"it asks for {str(argument)[:80]}")
+
+
+def _tensors(value: Any) -> Iterator[torch.Tensor]:
+    if isinstance(value, torch.Tensor):
+        yield value
+    elif isinstance(value, (dict, list, tuple)):
+        for inner in value.values() if isinstance(value, dict) else value:
+            yield from _tensors(inner)
 
 
 def stage_of(checkpoint: Mapping[str, Any]) -> str | None:
@@ -116,19 +191,6 @@ def _write(checkpoint: dict[str, Any], path: Path) -> None:
             torch.save(checkpoint, file)
     except RuntimeError as error:
         raise (error.__context__ if isinstance(error.__context__, OSError) else error) from None
-
-
-def _check_sums(path: Path) -> None:
-    """Compare every part with its checksum: torch does not, and a changed byte would load as another weight.
-
-    Raises:
-        BadZipFile: a part differs.
-    """
-    if zipfile.is_zipfile(path):
-        with zipfile.ZipFile(path) as archive:
-            broken = archive.testzip()
-        if broken:
-            raise zipfile.BadZipFile(f"'{broken}' was changed since it was written")
 
 
 def load_module(cls: type[M], path: str | os.PathLike[str], part: str) -> M:

@@ -12,7 +12,6 @@ import glob
 import hashlib
 import os
 import secrets
-import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +19,7 @@ from typing import Any
 
 from dds_lightning._version import __version__
 from dds_lightning.errors import UserError
+from dds_lightning.saving.untrusted import remove_tree
 
 STALE_AFTER = 3600.0
 """Seconds after which an unfinished file is taken for a leftover."""
@@ -40,7 +40,7 @@ def beside(path: Path) -> Path:
         with contextlib.suppress(OSError):
             touched = max(entry.stat().st_mtime for entry in (left, *left.rglob("*")))
             if time.time() - touched > STALE_AFTER:
-                shutil.rmtree(left) if left.is_dir() else left.unlink()
+                left.unlink() if left.is_symlink() or not left.is_dir() else remove_tree(left, path.parent)
     return path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
 
 
@@ -88,15 +88,15 @@ def folder_written_whole(folder: Path) -> Iterator[Path]:
             sync(folder.parent)
         finally:
             mend_folder(folder)
-            shutil.rmtree(part, ignore_errors=True)
+            remove_tree(part, part.parent)
 
 
 def mend_folder(folder: Path) -> None:
     """Finish an interrupted replacement of `folder`: restore the previous one, or delete it if a new one exists."""
     previous = _previous(folder)
-    if previous.is_dir():
+    if previous.is_dir() and not previous.is_symlink():
         if folder.exists():
-            shutil.rmtree(previous, ignore_errors=True)
+            remove_tree(previous, previous.parent)
         else:
             os.rename(previous, folder)
 

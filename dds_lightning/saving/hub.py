@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from dds_lightning.errors import UserError
+from dds_lightning.errors import UserError, lacks_extra
 from dds_lightning.saving.published import CONTENTS, SUMS, load_published
 
 PREFIX = "hf:"
@@ -77,8 +77,8 @@ def push(directory: str | Path, place: str, token: str | None = None, private: b
 
 
 def _parse(place: str) -> tuple[str, str | None]:
-    match = re.fullmatch(r"hf:([\w.-]+/[\w.-]+)(?:@([\w./-]+))?", str(place))
-    if match is None or ".." in place:
+    match = re.fullmatch(r"hf:(\w[\w.-]*/\w[\w.-]*)(?:@(\w[\w./-]*))?", str(place), flags=re.ASCII)
+    if match is None or ".." in place or "--" in match[1] or match[1].endswith((".", ".git")):
         raise UserError(f"'{place}' is not a Hub address, expected hf:OWNER/NAME or hf:OWNER/NAME@REVISION")
     return match[1], match[2]
 
@@ -87,7 +87,7 @@ def _hub() -> Any:
     try:
         import huggingface_hub
     except ImportError as error:
-        raise UserError("hf: needs huggingface_hub: pip install 'dds-lightning[hub]'") from error
+        raise lacks_extra("hf: needs huggingface_hub", "hub") from error
     return huggingface_hub
 
 

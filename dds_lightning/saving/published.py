@@ -15,20 +15,22 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 import safetensors
 import safetensors.torch
-import torch
 import yaml
 from torch import Tensor, nn
 
 from dds_lightning._version import __version__
 from dds_lightning.errors import UserError
+from dds_lightning.saving.arrays import read_tensors
+from dds_lightning.saving.build import build_module
 from dds_lightning.saving.files import folder_written_whole, mend_folder, neighbours, refuse_newer, sha256
+from dds_lightning.saving.untrusted import TEXT, mapping, read_json, read_text, read_yaml, regular_file
 
 FORMAT_VERSION = 1
 WEIGHTS, CONFIG, METRICS, CARD, SUMS = (
@@ -39,6 +41,8 @@ WEIGHTS, CONFIG, METRICS, CARD, SUMS = (
     "SHA256SUMS",
 )
 CONTENTS = (WEIGHTS, CONFIG, METRICS, CARD)
+LARGEST = 128 * TEXT
+"""Bytes of the weights, 33 million numbers. The paper's agent has 22 MB."""
 
 M = TypeVar("M", bound=nn.Module)
 
@@ -69,6 +73,33 @@ class Published:
             raise UserError(f"{self.directory / CONFIG} describes no '{part}'; it has {', '.join(self.config)}")
         state = {key.removeprefix(f"{part}."): value for key, value in self.state.items() if key.startswith(f"{part}.")}
         return build_module(cls, self.config[part], state, f"{self.directory} ({part})")
+
+    def acting(self) -> dict[str, Any]:
+        """How the agent acts: arguments of `DDSAgent` beside its modules.
+
+        Raises:
+            UserError: A value that no agent has; the message names it.
+        """
+        found = self.config.get("agent") or {"selection": "sample" if "policy" in self.config else "random"}
+        where = f"{self.directory / CONFIG}, agent"
+        chosen = mapping(found, where)
+        skill = self.config.get("skill")
+        count = skill.get("num_skills", 16) if isinstance(skill, dict) else 0
+        known: dict[str, Any] = {
+            "selection": str,
+            "temperature": (int, float),
+            "noise_scale": (int, float),
+            "seed": int,
+        }
+        for name, value in chosen.items():
+            if value is not None and name in known and (not isinstance(value, known[name]) or isinstance(value, bool)):
+                raise UserError(f"{where}: {name} is {value!r}, expected another kind of value")
+        codes = chosen.get("fixed_codes")
+        if codes is not None and not (
+            isinstance(codes, list) and codes and all(type(code) is int and 0 <= code < count for code in codes)
+        ):
+            raise UserError(f"{where}: fixed_codes is {str(codes)[:80]}, expected a list of codes of 0 to {count - 1}")
+        return {"selection": None, **chosen}
 
 
 def publish(
@@ -136,25 +167,31 @@ def load_published(directory: str | os.PathLike[str]) -> Published:
     if not directory.is_dir():
         raise UserError(f"there is no published checkpoint {directory}{neighbours(directory)}")
     there = sorted(entry.name for entry in directory.iterdir())
-    lacking = [name for name in (*CONTENTS, SUMS) if not (directory / name).is_file()]
+    lacking = [name for name in (*CONTENTS, SUMS) if not os.path.lexists(directory / name)]
     if lacking:
         raise UserError(
             f"{directory} is not a published checkpoint: it lacks {', '.join(lacking)}; "
-            f"it holds {', '.join(there) or 'nothing'}"
+            f"it holds {', '.join(there[:8]) or 'nothing'}{' ...' if there[8:] else ''}"
         )
+    root = _root(directory)
+    for name in (*CONTENTS, SUMS):
+        regular_file(directory / name, LARGEST if name == WEIGHTS else TEXT, root)
     _verify_sums(directory)
-    config = _read(directory / CONFIG, yaml.safe_load)
+    config = mapping(read_yaml(directory / CONFIG, root=root), directory / CONFIG)
     refuse_newer(directory / CONFIG, config.get("format_version"), FORMAT_VERSION)
-    try:
-        state = safetensors.torch.load_file(directory / WEIGHTS)
-    except (safetensors.SafetensorError, OSError, ValueError) as error:
-        raise UserError(f"{directory / WEIGHTS} is damaged: {error}") from None
-    return Published(directory, state, config, _read(directory / METRICS, json.loads))
+    state, _ = read_tensors(directory / WEIGHTS, largest=LARGEST, root=root)
+    return Published(directory, state, config, mapping(read_json(directory / METRICS), directory / METRICS))
+
+
+def _root(directory: Path) -> Path:
+    """The folder that links in a published directory may not leave: itself, or its repository in the Hub's cache."""
+    above = directory.resolve().parent
+    return above.parent if above.name == "snapshots" and (above.parent / "blobs").is_dir() else directory
 
 
 def _verify_sums(directory: Path) -> None:
     sums: dict[str, str] = {}
-    for line in (directory / SUMS).read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in read_text(directory / SUMS, 4096).splitlines():
         digest, _, name = line.partition("  ")
         if name not in CONTENTS or len(digest) != 64:
             raise UserError(f"{directory / SUMS}: '{line[:80]}' is not a valid line, expected a hash and a file name")
@@ -165,16 +202,6 @@ def _verify_sums(directory: Path) -> None:
                 f"{directory / name} is not the file that was published (its hash differs from {SUMS}): "
                 "fetch the directory again; if you changed it yourself, update the sums with `sha256sum`"
             )
-
-
-def _read(path: Path, parse: Callable[[str], Any]) -> dict[str, Any]:
-    try:
-        value = parse(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise UserError(f"{path} cannot be read: {str(error).splitlines()[0]}") from None
-    if not isinstance(value, dict):
-        raise UserError(f"{path} holds a {type(value).__name__}, expected names with values")
-    return value
 
 
 def _refuse_foreign(target: Path) -> None:
@@ -211,38 +238,3 @@ def _short_card(name: str, config: Mapping[str, Any]) -> str:
         f"# {name}\n\nDiscrete diffusion skills, written by dds-lightning.\n\n{about}\n\n"
         f'```python\nfrom dds_lightning import DDSAgent\n\nagent = DDSAgent.load("{name}")\n```\n'
     )
-
-
-def build_module(cls: type[M], settings: Mapping[str, Any], state: Mapping[str, Tensor], origin: str) -> M:
-    """Build a module and load its weights; errors name the file."""
-    # Lightning's command line stores `_instantiator` and the like, names of code to call: they are never followed.
-    settings = {key: value for key, value in settings.items() if not str(key).startswith("_")}
-    try:
-        with torch.device("meta"):  # takes no memory, whatever widths a file names
-            own = {name: value.shape for name, value in cls(**settings).state_dict().items()}
-    except TypeError as error:
-        reason = str(error).replace("__init__()", "it").replace(f"{cls.__name__}.", "")
-        raise UserError(f"{origin} does not hold a {cls.__name__} of this version: {reason}") from None
-    except UserError as error:
-        raise UserError(f"{origin}: {error}") from None
-    except (RuntimeError, ValueError, ArithmeticError, AssertionError) as error:
-        reason = str(error).split("\n", 1)[0]
-        raise UserError(f"{origin} holds settings with which no {cls.__name__} can be built: {reason}") from None
-    missing, unknown = sorted(own.keys() - state.keys()), sorted(state.keys() - own.keys())
-    if missing or unknown:
-        lists = ((what, names) for what, names in (("lacks", missing), ("has unknown", unknown)) if names)
-        text = " and ".join(f"{what} {', '.join(names[:3])}{' ...' if names[3:] else ''}" for what, names in lists)
-        raise UserError(f"{origin} does not fit {cls.__name__}: it {text}")
-    for name, value in state.items():
-        if value.shape != own[name]:
-            shapes = f"{tuple(value.shape)}, expected {tuple(own[name])}"
-            raise UserError(f"{origin} does not fit {cls.__name__}: {name} is {shapes}")
-    module = cls(**settings)
-    learnt = {name for name, _ in module.named_parameters()}
-    for name, value in state.items():
-        bad = ~torch.isfinite(value) if name in learnt else torch.isnan(value)  # a buffer may say "no bound"
-        if bool(bad.any()):
-            found = "NaN" if bool(torch.isnan(value).any()) else "infinity"
-            raise UserError(f"{origin} holds {found} in {name}: its training diverged; take an earlier checkpoint")
-    module.load_state_dict(state)
-    return module.eval()

@@ -13,25 +13,37 @@ own outputs are still there. It is *resumed* when it was started with exactly th
 finish. Otherwise what is there moves to `previous/` and the step starts over.
 """
 
+import errno
 import fcntl
 import hashlib
 import json
 import os
-import shutil
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from rich.console import Console
 
 from dds_lightning.errors import UserError
 from dds_lightning.saving.files import refuse_newer, sha256, written_whole
+from dds_lightning.saving.untrusted import (
+    TEXT,
+    conform,
+    is_inside,
+    mapping,
+    read_json,
+    refuse_links,
+    regular_file,
+    remove_tree,
+)
 
 FORMAT = 1
 MARKER = "stage.json"
+LOCK, PREVIOUS = "run.lock", "previous"
 Work = Callable[[Path, bool], Mapping[str, Any]]
 
 
@@ -109,7 +121,7 @@ class RunDirectory:
         else:
             reason = "" if not marker or self.fresh else f" again ({_difference(marker, expected)})"
             self._say(f"{title}{reason}", "bold")
-            _put_away(folder, self.root / "previous" / name)
+            _put_away(folder, self.root)
         folder.mkdir(parents=True, exist_ok=True)
         before = float(marker.get("seconds", 0.0)) if resuming else 0.0
         record = {"format": FORMAT, "stage": name, "state": "started", **expected, "seconds": before}
@@ -139,7 +151,7 @@ class RunDirectory:
         return result
 
     def _say(self, text: str, style: str) -> None:
-        self.console.print(f"[{style}]{text}[/]", highlight=False)
+        self.console.print(text, style=style, highlight=False, markup=False)
 
 
 @contextmanager
@@ -153,9 +165,10 @@ def locked(root: Path) -> Iterator[None]:
         raise UserError(f"out: {root} is a file, expected a folder for the run")
     created = not root.exists()
     root.mkdir(parents=True, exist_ok=True)
-    path = root / "run.lock"
+    refuse_links(root)
+    path = root / LOCK
     try:
-        with path.open("w") as file:
+        with _opened(path) as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -166,7 +179,20 @@ def locked(root: Path) -> Iterator[None]:
     finally:
         # A run that ended before its first stage leaves nothing behind.
         if created and [entry.name for entry in root.iterdir()] == [path.name]:
-            shutil.rmtree(root)
+            path.unlink()
+            root.rmdir()
+
+
+def _opened(path: Path) -> IO[bytes]:
+    """The lock's file, created if need be; what it holds stays, and a link is not followed."""
+    try:
+        if path.exists():
+            regular_file(path)  # a pipe or a device may do something when it is opened
+        return os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666), "rb")
+    except (OSError, UserError) as error:
+        if isinstance(error, OSError) and error.errno != errno.ELOOP:
+            raise
+        raise UserError(f"out: the lock of this run cannot be opened: {error}; delete it") from None
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -186,23 +212,43 @@ def duration(seconds: float) -> str:
 
 
 def read_marker(folder: Path) -> dict[str, Any]:
-    """The marker in a step's folder; empty if it is missing or damaged.
+    """The marker in a step's folder; empty if it is missing or damaged, about which a warning tells.
 
     Raises:
         UserError: A newer version of this package wrote it.
     """
+    path = folder / MARKER
+    if not path.exists():
+        return {}
     try:
-        value = json.loads((folder / MARKER).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        value = mapping(read_json(path, largest=16 * TEXT, root=folder.parent), path)
+        if value.get("format", FORMAT) == FORMAT:
+            _check_marker(value, folder)
+    except UserError as error:
+        warnings.warn(f"{error}; the stage counts as not done, and `dds run` does it again", stacklevel=2)
         return {}
-    if not isinstance(value, dict):
-        return {}
-    refuse_newer(folder / MARKER, value.get("format", FORMAT), FORMAT)
+    refuse_newer(path, value.get("format", FORMAT), FORMAT)
     return value
+
+
+def _check_marker(marker: Mapping[str, Any], folder: Path) -> None:
+    """Refuse a marker that no step wrote, or whose outputs lie outside of the run."""
+    what = str(folder / MARKER)
+    form: dict[str, Any] = {"settings": {}, "inputs": {}, "facts": {}, "outputs": {}}
+    found = conform(
+        {**form, "state": "", "seconds": 0.0, **marker}, {**form, "state": (str,), "seconds": (int, float)}, what
+    )
+    if "files" in marker:
+        conform(marker, {"files": dict.fromkeys(found["outputs"], (str,)), "stage": (str,)}, what)
+    for name, place in found["outputs"].items():
+        if not isinstance(place, str) or not is_inside(folder / place, folder.parent):
+            raise UserError(f"{what}: output {name} is {place!r}, expected a place in the run directory")
 
 
 def _found(folder: Path, marker: dict[str, Any]) -> Done | None:
     """The step as it was finished, if none of its outputs has changed."""
+    if not {"outputs", "files", "facts", "stage", "seconds"} <= marker.keys():
+        return None
     outputs = {key: folder / relative for key, relative in marker["outputs"].items()}
     if any(not path.exists() or _digest(path) != marker["files"][key] for key, path in outputs.items()):
         return None
@@ -226,11 +272,12 @@ def _json(value: Any) -> Any:
     return json.loads(json.dumps(value, default=str))
 
 
-def _put_away(folder: Path, previous: Path) -> None:
+def _put_away(folder: Path, root: Path) -> None:
+    """Move a step's folder to `previous/`, in place of what was there."""
     if not folder.exists():
         return
-    if previous.exists():
-        shutil.rmtree(previous)
+    previous = root / PREVIOUS / folder.name
+    remove_tree(previous, root)
     previous.parent.mkdir(parents=True, exist_ok=True)
     os.replace(folder, previous)
 

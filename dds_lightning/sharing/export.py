@@ -30,8 +30,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from dds_lightning.agent import DDSAgent
-from dds_lightning.errors import UserError
+from dds_lightning.errors import UserError, lacks_extra
 from dds_lightning.saving.files import written_whole
+from dds_lightning.saving.untrusted import mapping, parse_json
 
 Format = Literal["torch", "onnx"]
 INPUTS = ("observations", "codes", "gumbel", "noise")
@@ -179,7 +180,7 @@ def _load_onnx(path: Path) -> tuple[Callable[..., Any], dict[str, Any]]:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1  # one observation is too little to share
     session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-    facts = json.loads(session.get_modelmeta().custom_metadata_map[FACTS])
+    facts = mapping(parse_json(session.get_modelmeta().custom_metadata_map[FACTS], path), path)
 
     def call(*arrays: NDArray[Any]) -> Any:
         return tuple(session.run(list(OUTPUTS), dict(zip(INPUTS, arrays, strict=True))))
@@ -196,7 +197,7 @@ def _load_torch(path: Path) -> tuple[Callable[..., Any], dict[str, Any]]:
     def call(*arrays: NDArray[Any]) -> Any:
         return tuple(output.numpy() for output in module(*map(torch.from_numpy, arrays)))
 
-    return call, json.loads(extra[FACTS])
+    return call, mapping(parse_json(extra[FACTS], path), path)
 
 
 def latency(call: Callable[..., Any], arrays: tuple[NDArray[Any], ...], calls: int = 200) -> dict[str, float]:
@@ -245,7 +246,7 @@ def check_exported(agent: DDSAgent, path: str | Path) -> dict[str, Any]:
 def _need(*packages: str) -> None:
     missing = [name for name in packages if importlib.util.find_spec(name) is None]
     if missing:
-        raise UserError(f"ONNX needs {' and '.join(missing)}: pip install 'dds-lightning[export]'")
+        raise lacks_extra(f"ONNX needs {' and '.join(missing)}", "export")
 
 
 @contextlib.contextmanager

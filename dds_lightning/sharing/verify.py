@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import contextlib
+import re
+import signal
+import threading
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from torch import nn
 
 from dds_lightning.agent import DDSAgent
 from dds_lightning.errors import UserError
-from dds_lightning.saving.published import SUMS, Published, load_published
-from dds_lightning.training.stages import STAGES, Stage
+from dds_lightning.saving.published import CONFIG, SUMS, Published, load_published
+from dds_lightning.tasks import restore_task
+from dds_lightning.training.stages import STAGES
 
+SECONDS = 4
+"""Work that reading and checking may take each. Both take half a second for the largest of the shipped agents."""
 TOLERANCE = 1e-3
 """Largest difference between stored and computed answers: processors and library versions round differently, but other
 weights differ by more."""
@@ -32,13 +40,26 @@ def verify_published(directory: str | Path) -> dict[str, Any]:
     Raises:
         UserError: A check fails; the message names the file.
     """
-    published = load_published(directory)
-    modules = {name: published.module(stage.module_class(), name) for name, stage in _stages(published)}
+    told = f"{directory} takes more than {SECONDS} s of work to verify: no sound agent does"
+    with cpu_budget(SECONDS, told):
+        published = load_published(directory)
+    classes = {name: stage.module_class() for name, stage in STAGES.items()}  # imports much, which is not their fault
+    with cpu_budget(SECONDS, told):
+        return _verified(published, classes)
+
+
+def _verified(published: Published, classes: Mapping[str, type[nn.Module]]) -> dict[str, Any]:
+    directory = published.directory
+    names = [name for name in STAGES if isinstance(published.config.get(name), dict)]
+    modules = {name: published.module(classes[name], name) for name in names}
     if not modules:
         raise UserError(f"{directory} holds no module of a training stage, expected some of {', '.join(STAGES)}")
+    for name, module in modules.items():
+        _check_box(f"{directory} ({name})", module)
+    published.acting()
     facts: dict[str, Any] = {
         "directory": str(directory),
-        "task": published.config.get("task"),
+        "task": _task(published),
         "stages": list(modules),
         "format": published.config["format_version"],
         "parameters": sum(value.numel() for module in modules.values() for value in module.parameters()),
@@ -48,6 +69,7 @@ def verify_published(directory: str | Path) -> dict[str, Any]:
     }
     if "skill" not in modules:
         return facts
+    modules.clear()  # the agent has its own
     agent = DDSAgent.load(directory)
     facts |= {"horizon": agent.horizon, "num_skills": agent.num_skills}
     stored = published.config.get("golden")
@@ -56,9 +78,45 @@ def verify_published(directory: str | Path) -> dict[str, Any]:
     return facts
 
 
-def _stages(published: Published) -> list[tuple[str, Stage]]:
-    """The registered training stages whose modules a directory holds."""
-    return [(name, stage) for name, stage in STAGES.items() if isinstance(published.config.get(name), dict)]
+def _task(published: Published) -> str | None:
+    """The name of the task, which must not lead to another file."""
+    task, where = published.config.get("task"), published.directory / CONFIG
+    if task is not None and not (isinstance(task, str) and re.fullmatch(r"[\w-]+(@\w+)?", task)):
+        raise UserError(f"{where}: task is {str(task)[:80]!r}, expected the name of a task")
+    if published.config.get("task_definition") is not None:
+        restore_task(published.config, where)
+    return task
+
+
+def _check_box(where: str, module: nn.Module) -> None:
+    box = getattr(module, "action_box", None)
+    if box is not None and not bool((box.low < box.high).all()):
+        raise UserError(f"{where}: action_box is {box.low.tolist()} to {box.high.tolist()}, expected low below high")
+
+
+@contextlib.contextmanager
+def cpu_budget(seconds: float, message: str) -> Iterator[None]:
+    """Stop what takes too much work, whatever it is; does nothing outside the main thread.
+
+    Seconds of the processor count, not of the clock: a busy machine must not make a sound directory look bad.
+
+    Raises:
+        UserError: With `message`.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(*_: object) -> None:
+        raise UserError(message)
+
+    before = signal.signal(signal.SIGPROF, stop)
+    signal.setitimer(signal.ITIMER_PROF, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, before)
 
 
 def _compare(directory: str | Path, stored: Any, given: dict[str, Any]) -> float:
@@ -66,8 +124,9 @@ def _compare(directory: str | Path, stored: Any, given: dict[str, Any]) -> float
     for name, answer in given.items():
         try:
             expected = np.array(stored[name], dtype=np.float64)
-        except (KeyError, TypeError, ValueError) as error:
-            raise UserError(f"{directory}: golden, {name}: expected a table of numbers ({error!r})") from error
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            told = f"{type(error).__name__}: {str(error)[:80]}"
+            raise UserError(f"{directory}: golden, {name}: expected a table of numbers ({told})") from error
         if expected.shape != np.shape(answer):
             raise UserError(
                 f"{directory}: golden, {name}: found shape {expected.shape}, expected {np.shape(answer)}; the "

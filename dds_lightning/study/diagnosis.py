@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
+from dds_lightning.saving.untrusted import read_csv
 from dds_lightning.study.contestants import DATA_POLICY
 from dds_lightning.study.tables import BEST
 from dds_lightning.tasks import Task
@@ -111,6 +112,6 @@ def _last(path: Path | None, column: str) -> float:
     """Return the last logged value of a column; NaN if there is none."""
     if path is None:
         return math.nan
-    table = pd.read_csv(path)
+    table = read_csv(path, {})
     values = table[column].dropna().tolist() if column in table else []
     return float(values[-1]) if values else math.nan

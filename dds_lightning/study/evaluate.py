@@ -11,7 +11,8 @@ from dds_lightning.console.reports import Report, table
 from dds_lightning.errors import UserError
 from dds_lightning.rollout.actors import Contestant
 from dds_lightning.rollout.play import rollout
-from dds_lightning.saving.published import load_published
+from dds_lightning.saving.published import CONFIG, load_published
+from dds_lightning.saving.untrusted import conform
 from dds_lightning.study.contestants import agent_directory, best_directory, way
 from dds_lightning.study.protocol import BEST, LAST, heading, paper_line, protocol
 from dds_lightning.tasks import Task, get_task, restore_task
@@ -46,7 +47,7 @@ def evaluate(
     if count < 1:
         raise UserError(f"--episodes is {count}, expected at least 1")
     agents = {kind: _agent(place, wanted, seed, noise_scale) for kind, place in places.items()}
-    best = load_published(places[BEST]).config["checkpoint"] if BEST in places else None
+    best = _best_facts(places[BEST]) if BEST in places else None
     players: list[Contestant] = []
     shown: dict[str, str] = {}
     for kind, agent in agents.items():
@@ -72,6 +73,12 @@ def evaluate(
         report.data["episodes"] = out
         report.text.append(out)
     return report
+
+
+def _best_facts(place: Path) -> dict[str, Any]:
+    """Return how the best checkpoint was chosen, see `protocol.best_facts`."""
+    form = {"monitor": (str,), "value": (int, float), "step": (int,), "evaluations": (int, type(None))}
+    return conform(load_published(place).config.get("checkpoint"), form, f"{place / CONFIG}, checkpoint")
 
 
 def _places(directory: Path, checkpoint: str) -> dict[str, Path]:

@@ -104,19 +104,21 @@ def best_facts(last: Path, best: Path) -> dict[str, Any]:
     from dds_lightning.callbacks.best import BestCheckpoint, callback_state
     from dds_lightning.callbacks.rollouts import RolloutEvaluation
     from dds_lightning.saving.checkpoint import load_ckpt
+    from dds_lightning.saving.untrusted import parsing, safe_name
 
     checkpoint = load_ckpt(best)
     kept = callback_state(checkpoint, BestCheckpoint)
     if kept is None:
         raise UserError(f"{best} was not kept as a best checkpoint: it has no state of a BestCheckpoint")
-    evaluated = callback_state(load_ckpt(last), RolloutEvaluation) or {"history": []}
-    count = sum(kept["monitor"] in row for row in evaluated["history"])
-    return {
-        "monitor": kept["monitor"],
-        "value": float(kept["best_model_score"]),
-        "step": int(checkpoint["global_step"]),
-        "evaluations": count or None,
-    }
+    with parsing(best, "delete it, and train on"):
+        evaluated = callback_state(load_ckpt(last), RolloutEvaluation) or {"history": []}
+        count = sum(kept["monitor"] in row for row in evaluated["history"])
+        return {
+            "monitor": safe_name(kept["monitor"]),
+            "value": float(kept["best_model_score"]),
+            "step": int(checkpoint["global_step"]),
+            "evaluations": count or None,
+        }
 
 
 def start_value(task: Task, agent: DDSAgent, seed: int, episodes: int = 10) -> dict[str, float] | None:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from dds_lightning.saving.files import written_whole
+from dds_lightning.saving.untrusted import read_csv
 from dds_lightning.study.diagnosis import diagnose
 from dds_lightning.study.findings import Findings
 from dds_lightning.study.protocol import heading, paper_line
@@ -185,12 +186,15 @@ def _metrics(root: Path, stage: str, folder: Path) -> Path | None:
 
     What a launch logged after the step from which the next one resumed is left out.
     """
-    folders = sorted((root / stage / "logs").glob("version_*"), key=lambda path: int(path.name.split("_")[1]))
+    numbered = [path for path in (root / stage / "logs").glob("version_*") if path.name[8:].isdecimal()]
+    folders = sorted(numbered, key=lambda path: int(path.name[8:]))
     launches: list[pd.DataFrame] = []
     for path in (entry / "metrics.csv" for entry in folders):
         if not path.is_file() or not path.stat().st_size:
             continue
-        launch = pd.read_csv(path)
+        launch = read_csv(path, {"step": "iuf"}, remedy=f"delete it, or train {stage} again")
+        if launch.empty:
+            continue
         launches = [earlier[earlier["step"] < launch["step"].min()] for earlier in launches]
         launches.append(launch)
     if not launches:

@@ -6,6 +6,7 @@ import yaml
 
 from dds_lightning.errors import UserError
 from dds_lightning.saving.files import written_whole
+from dds_lightning.saving.untrusted import read_yaml
 from dds_lightning.tasks import Task, definition, is_own, remember
 from dds_lightning.tasks.own import build_task
 
@@ -28,10 +29,7 @@ def recall_task(run: Path) -> None:
     path = run / TASK_FILE
     if not path.is_file():
         return
-    try:
-        kept = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
+    kept = read_yaml(path, root=run, verdict="is not valid YAML")
     if not isinstance(kept, dict):
         raise UserError(f"{path} is not a mapping, expected the definition of a task")
     remember(build_task(kept, str(path), trusted=False))

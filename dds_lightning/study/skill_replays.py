@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dds_lightning.errors import UserError
 from dds_lightning.interpret.measure.replay import replay_codes
 from dds_lightning.interpret.measure.states import junctions as junctions
 from dds_lightning.interpret.measure.states import rest_states
+from dds_lightning.saving.arrays import read_npz
 from dds_lightning.saving.files import written_whole
+from dds_lightning.saving.published import SUMS
+from dds_lightning.saving.untrusted import read_text
 from dds_lightning.tasks import Task
 
 if TYPE_CHECKING:
@@ -50,13 +55,35 @@ def stored_replays(path: Path, task: Task, directory: Path) -> Arrays:
     """
     from dds_lightning.agent import DDSAgent
 
-    key = json.dumps({"task": task.name, "agent": (directory / "SHA256SUMS").read_text(encoding="utf-8")})
-    if path.is_file():
-        with np.load(path, allow_pickle=False) as stored:
-            if str(stored.get("key")) == key:
-                return {name: stored[name] for name in stored.files if name != "key"}
-    arrays = replay_skills(task, DDSAgent.load(directory))
+    key = json.dumps({"task": task.name, "agent": read_text(directory / SUMS)})
+    agent = DDSAgent.load(directory)
+    if path.exists():
+        try:
+            stored: Arrays = dict(read_npz(path, root=path.parent))
+            if str(stored.pop("key", "")) == key:
+                return _checked(stored, agent.num_skills, path)
+        except UserError as error:
+            warnings.warn(f"{error}; the skills are played again", stacklevel=2)
+    arrays = replay_skills(task, agent)
     entries: dict[str, Any] = {"key": np.array(key), **arrays}
     with written_whole(path) as part, part.open("wb") as file:
         np.savez_compressed(file, **entries)
     return arrays
+
+
+def _checked(stored: Arrays, num_skills: int, path: Path) -> Arrays:
+    """Return stored replays if they have the shapes and values of `replay_skills`.
+
+    Raises:
+        UserError: They do not.
+    """
+    count, steps = np.shape(stored.get("alive", 0)) if np.ndim(stored.get("alive", 0)) == 2 else (0, 0)
+    forms = {"starts": ((count, 2), "f"), "positions": ((count, steps + 1, 2), "f"), "codes": ((count,), "iu")}
+    for name, (shape, kinds) in {**forms, "alive": ((count, steps), "b")}.items():
+        array = stored.get(name, np.zeros(0))
+        if not count or array.shape != shape or array.dtype.kind not in kinds:
+            raise UserError(f"{path} is damaged: {name} have shape {array.shape}, expected {shape}")
+    codes = stored["codes"]
+    if codes.min() < 0 or codes.max() >= num_skills or not np.isfinite(stored["starts"]).all():
+        raise UserError(f"{path} is damaged: it holds other codes than 0 to {num_skills - 1}, or no starts")
+    return {name: stored[name] for name in ("starts", "positions", "codes", "alive")}

@@ -16,7 +16,8 @@ from dds_lightning.rollout.actors import single_skills
 from dds_lightning.rollout.play import rollout
 from dds_lightning.rollout.result import RolloutResult
 from dds_lightning.saving.files import neighbours
-from dds_lightning.saving.run_directory import read_marker
+from dds_lightning.saving.run_directory import MARKER, read_marker
+from dds_lightning.saving.untrusted import conform
 from dds_lightning.skill import SkillModule
 from dds_lightning.study.contestants import agent_directory, way
 from dds_lightning.study.findings import Findings
@@ -86,6 +87,7 @@ def _data_of(run: Path) -> tuple[str | None, str | None]:
     """Return data and task of a run; both None if it is not a run."""
     marker = read_marker(run / "data")
     settings = marker.get("settings", {})
+    conform(settings, dict.fromkeys(("data", "task"), (str, type(None))), f"{run / 'data' / MARKER}, settings")
     collected = marker.get("outputs", {}).get("data")
     return settings.get("data") or (f"local:{run / 'data' / collected}" if collected else None), settings.get("task")
 

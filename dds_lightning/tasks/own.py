@@ -24,9 +24,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from dds_lightning.errors import UserError
+from dds_lightning.saving.untrusted import read_yaml
 from dds_lightning.tasks.bodies import BODIES, Body, StateLayout, has_state, state_layout
 from dds_lightning.tasks.task import Task
 
@@ -74,10 +74,7 @@ def load_task(address: str) -> Task:
         raise UserError(f"task: there is no file {path}")
     if path.stat().st_size > LARGEST:
         raise UserError(f"task: {path} has {path.stat().st_size} bytes, expected at most {LARGEST}")
-    try:
-        given = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise UserError(f"task: {path} is not valid YAML: {' '.join(str(error).split())}") from None
+    given = read_yaml(path, LARGEST, verdict="is not valid YAML", remedy="mend it")
     if not isinstance(given, dict):
         raise UserError(f"task: {path} is not a mapping, expected for example env_id: Reacher-v5")
     return build_task({"name": path.stem, **given}, str(path))
@@ -133,8 +130,11 @@ def _check(values: Mapping[str, Any], where: str, trusted: bool) -> None:
     pattern = r"([\w.]+:)?[\w./-]+" if trusted else r"[\w./-]+"
     rules = [
         ("name", re.fullmatch(r"[\w-]+", values["name"]) is not None, "letters, digits, '_' and '-'"),
+        ("family", trusted or re.fullmatch(r"[\w-]+", values.get("family", FAMILY)) is not None, "a preset's name"),
         ("env_id", re.fullmatch(pattern, values["env_id"]) is not None, "a name that Gymnasium knows"),
         ("max_episode_steps", values["max_episode_steps"] >= 1, "at least 1"),
+        ("max_episode_steps", trusted or values["max_episode_steps"] <= 10**6, "at most a million"),
+        ("evaluation_episodes", trusted or values.get("evaluation_episodes", 1) <= 10**5, "at most 100,000"),
         ("score_max", values["score_max"] > values["score_min"], f"more than score_min={values['score_min']}"),
         *((name, values.get(name, 1) >= 1, "at least 1") for name in ("observation_dim", "action_dim")),
         ("evaluation_episodes", values.get("evaluation_episodes", 1) >= 1, "at least 1"),

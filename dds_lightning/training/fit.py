@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import signal
+import traceback
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +21,11 @@ from dds_lightning.console import interrupts
 from dds_lightning.errors import UserError, is_out_of_memory, reason
 from dds_lightning.module import StageModule
 from dds_lightning.training.stages import Stage, get_stage
+
+_CONNECTOR = "checkpoint_connector.py"
+"""Where Lightning restores the state of a training at its start."""
+_RESTORING = ("load_state_dict", "_load_state_dicts", "set_rng_state")
+"""What restores the rest later, when loaders are made and training starts."""
 
 
 class Fitted(NamedTuple):
@@ -62,7 +68,12 @@ def fit(
     if checkpoint is None:
         module.refuse_frozen_without_weights()
     try:
-        with advice_on_memory(trainer, module, data), torch_threads(stage.threads), interrupts.deferred():
+        with (
+            resuming(checkpoint),
+            advice_on_memory(trainer, module, data),
+            torch_threads(stage.threads),
+            interrupts.deferred(),
+        ):
             trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     except SIGTERMException:  # before the first step; Lightning would end with status 0
         raise interrupts.Interrupted(signal.SIGTERM) from None
@@ -70,6 +81,29 @@ def fit(
     best = next((c.best_model_path for c in trainer.checkpoint_callbacks if isinstance(c, BestCheckpoint)), None)
     metrics = saved.latest(trainer) if saved else {name: float(x) for name, x in trainer.callback_metrics.items()}
     return Fitted(saved.path if saved else None, best or None, trainer.global_step, metrics, trainer.log_dir)
+
+
+@contextlib.contextmanager
+def resuming(checkpoint: str | Path | None) -> Iterator[None]:
+    """Turn what goes wrong while the state in a checkpoint is restored into one sentence; other errors pass.
+
+    Raises:
+        UserError: The state is damaged, or another training's.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        frames = [frame.f_code for frame, _ in traceback.walk_tb(error.__traceback__)]
+        restores = any(code.co_name in _RESTORING or code.co_filename.endswith(_CONNECTOR) for code in frames)
+        if checkpoint is None or not restores:
+            raise
+        told = f"{type(error).__name__}: {' '.join(reason(error).split())[:200]}"
+        raise UserError(
+            f"{checkpoint} cannot be continued, its state is damaged or another training's ({told}): take an earlier "
+            "checkpoint, or start from its weights with --model.init_from"
+        ) from error
 
 
 def rolling(trainer: pl.Trainer) -> RollingCheckpoint | None:

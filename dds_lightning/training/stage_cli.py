@@ -15,7 +15,6 @@ from typing import Any, Literal
 
 import lightning.pytorch as pl
 import torch
-import yaml
 from jsonargparse import ArgumentError, Namespace
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from rich.console import Console
@@ -30,6 +29,7 @@ from dds_lightning.errors import UserError
 from dds_lightning.finetune import read
 from dds_lightning.saving.checkpoint import load_ckpt, stage_of
 from dds_lightning.saving.files import short
+from dds_lightning.saving.untrusted import mapping, parse_yaml
 from dds_lightning.tasks.own import is_address
 from dds_lightning.training.fit import advice_on_memory, fit, quieten
 from dds_lightning.training.precision import fastest_precision
@@ -116,7 +116,7 @@ class StageCLI(LightningCLI):
     def dump(self) -> dict[str, Any]:
         """All settings, defaults included, as plain values: what `--print_config` prints."""
         parser = self._parser(self.config.subcommand)
-        return yaml.safe_load(parser.dump(self.settings, skip_unset=False, skip_validation=True))
+        return mapping(parse_yaml(parser.dump(self.settings, skip_unset=False, skip_validation=True), "dump"), "dump")
 
     def _parse_ckpt_path(self) -> None:
         """Complete the settings from the checkpoint that is named, if one is."""

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import warnings
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import docstring_parser
 import numpy as np
@@ -151,6 +151,15 @@ DAMAGES = {
     "another type": (lambda tensors, about: tensors.update(codes=torch.zeros(10)), "codes has type torch.float32"),
     "a code too high": (lambda tensors, about: tensors["codes"].fill_(4), "codes run from 4 to 4, expected 0 to 3"),
     "a negative code": (lambda tensors, about: tensors["codes"].fill_(-1), "codes run from -1"),
+    "a discount above one": (lambda tensors, about: tensors["discounts"].fill_(1.5), "discounts run from 1.5 to 1.5"),
+    "a negative discount": (lambda tensors, about: tensors["discounts"].fill_(-1), "discounts run from -1"),
+    "done twice": (lambda tensors, about: tensors["dones"].fill_(2), "dones run from 2 to 2, expected 0 to 1"),
+    "a step before the first": (lambda tensors, about: tensors["starts"].fill_(-3), "starts run from -3"),
+    "an episode before the first": (lambda tensors, about: tensors["episodes"].fill_(-3), "episodes run from -3"),
+    "wider next states": (
+        lambda tensors, about: tensors.update(next_observations=torch.zeros(10, 7)),
+        "next_observations have shape",
+    ),
     "a reward that is not a number": (
         lambda tensors, about: tensors["rewards"].fill_(torch.nan),
         "rewards contains numbers",
@@ -242,6 +251,30 @@ def test_the_data_module_relabels_once_and_splits_by_episode(trajectories, skill
         "discounts": (4,),
         "dones": (4,),
     }
+
+
+IMPOSSIBLE = {
+    "codes": lambda made: {"codes": made.codes.clone().fill_(3), "num_skills": 9},
+    "discounts": lambda made: {"discounts": made.discounts * 0.5},
+    "dones": lambda made: {"dones": 1 - made.dones},
+    "rewards": lambda made: {"rewards": made.rewards + 1},
+    "starts": lambda made: {"starts": made.starts + 1},
+    "episodes": lambda made: {"episodes": made.episodes + 10**6},
+    "observations": lambda made: {"observations": made.observations + 1},
+    "next_observations": lambda made: {"next_observations": made.observations.clone()},
+    "fewer": lambda made: {name: getattr(made, name)[:-1].clone() for name in relabelling._STORED},
+}
+
+
+@pytest.mark.parametrize("case", IMPOSSIBLE)
+def test_transitions_that_the_data_cannot_give_are_refused_under_the_right_key(trajectories, skill, tmp_path, case):
+    """Its story: the key says what a file claims to be, and anybody can write it."""
+    first = module(trajectories, skill, tmp_path)
+    first.prepare_data()
+    made = Relabelled.load(first.cache_file())
+    replace(made, **IMPOSSIBLE[case](made)).save(first.cache_file(), first.key)
+    with pytest.raises(UserError, match=rf"{first.cache_file().name}.*: delete it and relabel"):
+        module(trajectories, skill, tmp_path).setup()
 
 
 def test_other_skills_or_settings_never_read_a_stale_cache(trajectories, skill, tmp_path):

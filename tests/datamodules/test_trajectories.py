@@ -1,12 +1,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from datamodules.sources import load_trajectories
 from datamodules.trajectories import DataError, Trajectories
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import get_task
@@ -157,3 +159,96 @@ def test_data_know_the_task_that_they_were_loaded_for(three: Trajectories, tmp_p
     assert known.fingerprint() == mark
     assert known.select([2, 0]).task == task
     assert Trajectories.load(known.save(tmp_path / "set")).task is None
+
+
+# ---------------------------------------------------------------- stored arrays are checked as every source
+
+
+def _stored(three: Trajectories, folder: Path, **changes: Any) -> Path:
+    """The set on disk with other arrays, under a fingerprint that fits them."""
+    return replace(three, **changes).save(folder)
+
+
+def _with(array: Any, index: Any, value: Any) -> Any:
+    copy = array.copy()
+    copy[index] = value
+    return copy
+
+
+IMPOSSIBLE: dict[str, tuple[Callable[[Trajectories], dict[str, Any]], str]] = {
+    "NaN": (
+        lambda t: {"observations": _with(t.observations, (7, 1), np.nan)},
+        "observations: got nan at row 7, column 1",
+    ),
+    "infinity": (lambda t: {"rewards": _with(t.rewards, 3, np.inf)}, "rewards: got inf at row 3"),
+    "outside": (lambda t: {"actions": _with(t.actions, (4, 0), 1e6)}, r"actions: got 1e\+06 at step 4, column 0"),
+    "low above high": (
+        lambda t: {"action_low": t.action_high, "action_high": t.action_low},
+        "got 1 and -1 in column 0",
+    ),
+    "low is high": (lambda t: {"action_low": t.action_high}, "expected finite bounds, the lower one below"),
+    "no bound": (lambda t: {"action_high": t.action_high * np.float32(np.inf)}, "got -1 and inf in column 0"),
+    "two bounds": (lambda t: {"action_low": np.repeat(t.action_low, 2)}, "expected one bound a column"),
+    "early end": (lambda t: {"terminations": _with(t.terminations, 2, True)}, "an end at step 2, inside an episode"),
+    "no end": (lambda t: {"truncations": _with(t.truncations, 4, False)}, "episode 0: never ends"),
+    "negative": (lambda t: {"lengths": np.array([5, -1, 8])}, "lengths: got shape"),
+    "overflow": (lambda t: {"lengths": np.array([2**62, 2**62, 2**62])}, "lengths: got shape"),
+    "a table of lengths": (lambda t: {"lengths": t.lengths[None]}, r"lengths: got shape \(1, 3\)"),
+    "flat observations": (lambda t: {"observations": t.observations[:, 0]}, r"observations: got shape \(15,\)"),
+    "no columns": (lambda t: {"observations": t.observations[:, :0]}, r"observations: got shape \(15, 0\)"),
+    "rewards in columns": (lambda t: {"rewards": t.rewards[:, None]}, r"rewards: got shape \(12, 1\)"),
+    "too few": (lambda t: {"actions": t.actions[:-1]}, r"actions: got shape \(11, 1\), expected \(12, width\)"),
+    "flags of seven": (
+        lambda t: {"terminations": np.full(12, 7, np.uint8).view(np.bool_)},
+        "terminations: got a byte 7, expected 0 or 1",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", IMPOSSIBLE)
+@pytest.mark.parametrize("mmap", [False, True])
+def test_impossible_arrays_are_refused_whatever_their_fingerprint(
+    three: Trajectories, tmp_path: Path, case: str, mmap: bool
+) -> None:
+    change, message = IMPOSSIBLE[case]
+    with pytest.raises(DataError, match=message) as told:
+        Trajectories.load(_stored(three, tmp_path / "set", **change(three)), mmap=mmap)
+    assert "data set 'three'" in str(told.value)
+
+
+@pytest.mark.parametrize(("low", "high"), [(1.0, -1.0), (0.0, 0.0), (-np.inf, 1.0), (np.nan, 1.0)])
+def test_bounds_of_no_box_are_refused(make_episode: Make, low: float, high: float) -> None:
+    with pytest.raises(DataError, match=r"action_low and action_high: got .* expected finite bounds"):
+        Trajectories.from_episodes("mine", [make_episode(4, 0)], action_low=low, action_high=high)
+
+
+def test_arrays_must_fit_the_box_of_their_task(tmp_path: Path) -> None:
+    task = get_task("pointmaze-umaze-play")
+    start = np.zeros(task.observation_dim)
+    start[:2] = task.start_xy()
+    episode = {"observations": np.tile(start, (6, 1)), "actions": np.full((5, 2), 40.0), "rewards": np.zeros(5)}
+    episode |= {"terminations": np.zeros(5, bool), "truncations": np.arange(5) == 4}
+    wide = Trajectories.from_episodes("wide", [episode], action_low=-50.0, action_high=50.0)
+    folder = wide.save(tmp_path / "wide")
+    assert load_trajectories(f"arrays:{folder}").num_steps == 5
+    with pytest.raises(DataError, match="data set 'wide', actions: got 40 at step 0, column 0, expected -1 to 1"):
+        load_trajectories(f"arrays:{folder}", task)
+    far = {**episode, "observations": episode["observations"] + 1000.0, "actions": np.zeros((5, 2))}
+    folder = Trajectories.from_episodes("far", [far]).save(tmp_path / "far")
+    with pytest.raises(DataError, match=r"data set 'far', observations: 100% of the positions lie outside"):
+        load_trajectories(f"arrays:{folder}", task)
+
+
+@pytest.mark.parametrize(
+    "facts", ["[]", "{}", '{"name": "a", "format": 1}', '{"name": 1, "format": "x", "fingerprint": "f"}', "[" * 10**5]
+)
+def test_facts_of_no_data_set_are_refused(three: Trajectories, tmp_path: Path, facts: str) -> None:
+    folder = three.save(tmp_path / "set")
+    (folder / "trajectories.json").write_text(facts)
+    with pytest.raises(UserError, match=r"trajectories\.json"):
+        Trajectories.load(folder)
+
+
+def test_a_name_reaches_nobody_as_more_than_a_name(three: Trajectories, tmp_path: Path) -> None:
+    folder = replace(three, name="\x1b[2J<b>mine</b>").save(tmp_path / "set")
+    assert Trajectories.load(folder).name == "2Jbmine/b"

@@ -73,7 +73,11 @@ def test_a_changed_file_is_refused_before_sending_and_after_fetching(hub, tmp_pa
     assert not (hub.root / "somebody/other").exists()
 
 
-@pytest.mark.parametrize("place", ["hf:", "hf:maze", "hf:a/b/c", "hf:../x", "hf:a/b@", "https://a/b"])
+PLACES = ["hf:", "hf:maze", "hf:a/b/c", "hf:../x", "hf:a/b@", "hf:./.", "hf:a/.", "hf:.a/b", "hf:-a/b", "hf:a/b@.."]
+PLACES += ["hf:a/b.git", "hf:\u00e4/b", "hf:a--b/c", "https://a/b"]
+
+
+@pytest.mark.parametrize("place", PLACES)
 def test_other_places_are_refused(hub, place):
     with pytest.raises(UserError, match="is not a Hub address, expected hf:OWNER/NAME"):
         pull(place)
@@ -86,7 +90,7 @@ def test_a_repository_that_is_not_there_is_one_sentence(hub):
 
 def test_without_the_extra_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    with pytest.raises(UserError, match=r"pip install 'dds-lightning\[hub\]'"):
+    with pytest.raises(UserError, match=r"pip install -e '\.\[hub\]'` in the folder of this project's checkout"):
         pull("hf:somebody/maze")
 
 

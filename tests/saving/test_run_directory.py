@@ -1,6 +1,8 @@
 """A run directory: what is done is skipped, what was interrupted goes on, what changed is done again."""
 
 import json
+import os
+import shutil
 
 import pytest
 from rich.console import Console
@@ -140,3 +142,80 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path):
 )
 def test_durations_read_like_speech(seconds, text):
     assert duration(seconds) == text
+
+
+# ---------------------------------------------------------------- links of a stranger's run directory
+
+
+@pytest.fixture
+def precious(tmp_path):
+    """A folder of the user's that a stranger's link points to."""
+    folder = tmp_path / "precious"
+    folder.mkdir()
+    for name in ("thesis", "first", "second"):
+        (folder / name).mkdir()
+        (folder / name / "text").write_text("years of work")
+    (folder / "file").write_text("years of work")
+    return folder
+
+
+def contents(folder):
+    return {path.relative_to(folder): path.read_text() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("link", "target"),
+    [
+        ("run.lock", "file"),
+        ("run.lock", "new"),
+        ("previous", "."),
+        ("first", "thesis"),
+        ("second/logs", "thesis"),
+        ("second/stage.json", "file"),
+        ("report", "thesis"),
+    ],
+)
+def test_a_link_out_of_a_run_directory_is_refused_and_its_target_stays_as_it_is(script, precious, link, target):
+    script.run()
+    before = contents(precious)
+    place = script.root / link
+    if place.is_dir():
+        shutil.rmtree(place)
+    place.unlink(missing_ok=True)
+    place.symlink_to(precious / target)
+    with (
+        pytest.raises(UserError, match=f"{link} is a link to .*expected the file or folder itself"),
+        locked(script.root),
+    ):
+        script.run(fresh=True)
+    assert contents(precious) == before
+
+
+def test_the_run_directory_itself_may_be_a_link_of_the_users(script, tmp_path):
+    script.run()
+    (tmp_path / "link").symlink_to(script.root)
+    with locked(tmp_path / "link"):
+        script.run(width=2)
+    assert (tmp_path / "link" / "previous" / "first" / "out.txt").read_text() == "width 1"
+
+
+def test_a_previous_folder_that_is_a_link_is_not_followed_even_without_the_lock(script, precious):
+    script.run()
+    (script.root / "previous").symlink_to(precious)
+    before = contents(precious)
+    with pytest.raises(UserError, match="was not deleted: there is a link on the way"):
+        script.run(width=2)
+    assert contents(precious) == before
+
+
+def test_a_lock_is_opened_without_being_emptied(tmp_path):
+    (tmp_path / "run.lock").write_text("mine")
+    with locked(tmp_path):
+        pass
+    assert (tmp_path / "run.lock").read_text() == "mine"
+
+
+def test_a_lock_that_is_a_pipe_does_not_wait(tmp_path):
+    os.mkfifo(tmp_path / "run.lock")
+    with pytest.raises(UserError, match=r"run\.lock is a pipe or a device.*delete it"), locked(tmp_path):
+        pass

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from dds_lightning.interpret.draw import clip
 from dds_lightning.policy import PolicyModule
 from dds_lightning.rollout.result import RolloutPath, RolloutResult
 from dds_lightning.skill import SkillModule
-from dds_lightning.study import findings
+from dds_lightning.study import findings, skill_replays
 from dds_lightning.study import report as report_module
 from dds_lightning.study.report import report, summary_lines, write_report
 from dds_lightning.study.skill_replays import junctions, replay_skills
@@ -247,3 +248,156 @@ def test_replays_begin_in_their_cells_and_stay_in_the_maze(run):
     np.testing.assert_array_equal(np.isnan(arrays["positions"][:, 1:, 0]), ~arrays["alive"])
     again = replay_skills(TASK, agent, steps=7)
     np.testing.assert_array_equal(arrays["positions"], again["positions"])
+
+
+# ---------------------------------------------------------------- a stranger's run
+
+
+@pytest.fixture
+def other(run, tmp_path):
+    """A copy of the run without its report."""
+    shutil.copytree(run, tmp_path / "other", ignore=shutil.ignore_patterns("report"))
+    return tmp_path / "other"
+
+
+def episodes(**columns):
+    """Writes the run's table with other columns; None leaves one out."""
+
+    def change(path):
+        table = pd.read_parquet(path)
+        for name, value in columns.items():
+            table = table.drop(columns=name) if value is None else table.assign(**{name: value})
+        table.attrs = {"task": TASK.name}
+        table.to_parquet(path)
+
+    return change
+
+
+def arrays(**changes):
+    def change(path):
+        with np.load(path) as stored:
+            held = {**stored}
+        for name, value in changes.items():
+            held[name] = value(held[name])
+        np.savez(path, **held)
+
+    return change
+
+
+def content(data):
+    return lambda path: path.write_bytes(data)
+
+
+def protocol(**changes):
+    def change(path):
+        marker = json.loads(path.read_text())
+        marker["facts"]["protocol"] |= changes
+        path.write_text(json.dumps(marker))
+
+    return change
+
+
+FOREIGN = {
+    "a table that is none": ("evaluate/episodes.parquet", content(b"PAR1 and no more")),
+    "an empty table": ("evaluate/episodes.parquet", content(b"")),
+    "a table of something else": ("evaluate/episodes.parquet", lambda p: pd.DataFrame({"a": [1]}).to_parquet(p)),
+    "no actor": ("evaluate/episodes.parquet", episodes(actor=None)),
+    "actors that are numbers": ("evaluate/episodes.parquet", episodes(actor=3)),
+    "actors that are missing": ("evaluate/episodes.parquet", episodes(actor=pd.Series([None] * 12, dtype="str"))),
+    "lengths that are text": ("evaluate/episodes.parquet", episodes(length="long")),
+    "negative lengths": ("evaluate/episodes.parquet", episodes(length=-5)),
+    "a score of NaN": ("evaluate/episodes.parquet", episodes(score=float("nan"))),
+    "codes that are numbers": ("evaluate/episodes.parquet", episodes(codes=3)),
+    "codes of a billion": ("evaluate/episodes.parquet", episodes(codes=[[10**9]] * 12)),
+    "a final code of a billion": ("evaluate/episodes.parquet", episodes(final_code=10**9)),
+    "an episode twice": ("evaluate/episodes.parquet", episodes(episode=0)),
+    "an end far away": ("evaluate/episodes.parquet", episodes(final_x=1e300)),
+    "success of text": ("evaluate/episodes.parquet", episodes(success="yes")),
+    "paths that are none": ("evaluate/paths.npz", content(b"PK\x03\x04")),
+    "paths of nothing": ("evaluate/paths.npz", lambda p: np.savez(p, a=np.zeros(1))),
+    "paths too short": ("evaluate/paths.npz", arrays(positions=lambda a: a[:-1])),
+    "paths of three columns": ("evaluate/paths.npz", arrays(positions=lambda a: np.repeat(a, 2, axis=1))),
+    "paths of text": ("evaluate/paths.npz", arrays(codes=lambda a: a.astype(str))),
+    "codes that are none": ("relabel/codes.csv", content(b"\xff\xfe\x00")),
+    "codes without a share": ("relabel/codes.csv", content(b"code\n0\n1\n")),
+    "codes of markup": ("relabel/codes.csv", content(b"code,share,dx,dy,distance\n0,<script>,1,1,1\n")),
+    "a code twice": ("relabel/codes.csv", content(b"code,share,dx,dy,distance\n0,1,1,1,1\n0,1,1,1,1\n")),
+    "metrics that are none": ("skill/logs/version_0/metrics.csv", content(b"a,b\n1,x\n")),
+    "a protocol of markup": ("evaluate/stage.json", protocol(episodes="<script>")),
+    "a protocol without noise": ("evaluate/stage.json", protocol(noise_scale=None)),
+    "a task that is a list": ("task.yaml", content(b"- 1\n")),
+    "a task of tags": ("task.yaml", content(b"!!python/object/apply:os.mkdir [ran]")),
+}
+
+
+@pytest.mark.parametrize("case", FOREIGN)
+def test_a_damaged_or_foreign_file_of_a_run_is_named_in_one_sentence(other, case):
+    name, change = FOREIGN[case]
+    change(other / name)
+
+    def read():
+        findings.Findings.read(other)
+        report_module._metrics(other, "skill", other)
+
+    with pytest.raises(UserError) as told:
+        read()
+    message = str(told.value)
+    assert str(other / name) in message
+    assert "\n" not in message
+    assert len(message) < 600
+    assert not Path("ran").exists()
+
+
+MARKERS = [b"", b"{", b"[]", b"3", b'{"facts": 1}', b'{"settings": [1]}', b'{"state": 3}', b'{"seconds": "long"}']
+MARKERS += [
+    b'{"outputs": {"a": 1}}',
+    b'{"outputs": {"a": "../../../etc/passwd"}}',
+    b'{"outputs": {"a": "b"}, "files": {}}',
+]
+
+
+@pytest.mark.parametrize("data", MARKERS)
+def test_a_damaged_marker_is_named_and_the_report_does_without_it(other, data):
+    (other / "evaluate" / "stage.json").write_bytes(data)
+    with pytest.warns(
+        UserWarning, match=r"evaluate/stage\.json.*the stage counts as not done, and `dds run` does it again"
+    ):
+        assert findings.Findings.read(other).protocol is None
+
+
+def test_names_of_a_strangers_table_are_names_and_nothing_else(other):
+    table = pd.read_parquet(other / "evaluate" / "episodes.parquet")
+    evil = "AWR <img src=x onerror=alert(1)>\x1b]0;owned\x07 ![](http://tracker) |"
+    table["actor"] = table["actor"].replace("AWR policy, sampled", evil)
+    table["label"] = table["label"].replace("AWR policy, sampled", evil)
+    table.attrs = {"task": TASK.name}
+    table.to_parquet(other / "evaluate" / "episodes.parquet")
+    protocol(checkpoint="<script>\x1b[2J")(other / "evaluate" / "stage.json")
+    made = write_report(other)
+    text = made["report"].read_text(encoding="utf-8")
+    assert "AWR img src" in text
+    for written in (text, *(path.read_text(encoding="utf-8") for path in (other / "report").glob("*.csv"))):
+        assert not re.search(r"[<\x1b\x07]|!\[\]\(http", written)
+    assert "\x1b" not in repr(summary_lines(made)[0])
+
+
+REPLAYS = {
+    "none": content(b"PK"),
+    "empty": content(b""),
+    "codes out of range": arrays(codes=lambda a: a + 50),
+    "other shapes": arrays(positions=lambda a: a[:, :-1]),
+    "text": arrays(alive=lambda a: a.astype(str)),
+}
+
+
+@pytest.mark.parametrize("case", REPLAYS)
+def test_damaged_replays_are_named_and_played_again(run, made, tmp_path, monkeypatch, case):
+    path = tmp_path / "replays.npz"
+    shutil.copy(run / "report" / "replays.npz", path)
+    with np.load(path) as stored:
+        sound = {name: stored[name] for name in ("starts", "positions", "codes", "alive")}
+    REPLAYS[case](path)
+    monkeypatch.setattr(skill_replays, "replay_skills", lambda task, agent: sound)
+    with pytest.warns(UserWarning, match=r"replays\.npz is damaged.*the skills are played again"):
+        again = skill_replays.stored_replays(path, TASK, run / "agent")
+    assert again["codes"].tolist() == sound["codes"].tolist()

@@ -18,15 +18,13 @@ import mujoco
 import numpy as np
 import torch
 
-from dds_lightning.errors import UserError
+from dds_lightning.errors import UserError, lacks_extra
 
 try:
     from stable_baselines3 import PPO
     from stable_baselines3.common.callbacks import BaseCallback
 except ImportError as missing:
-    raise UserError(
-        "training a behaviour needs stable-baselines3: pip install 'dds-lightning[behaviours]'"
-    ) from missing
+    raise lacks_extra("training a behaviour needs stable-baselines3", "behaviours") from missing
 
 from datamodules.behaviours.training.ant_world import AntWorld
 from datamodules.behaviours.training.learner import build_learner, export_policy, load_state, save_state

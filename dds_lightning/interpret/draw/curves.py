@@ -8,6 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from dds_lightning.saving.untrusted import read_csv
+
 PANELS = {
     "skill": (
         ("train/denoising", "denoising loss"),
@@ -30,7 +32,7 @@ WRAP = 22
 
 def read_metrics(path: str | Path) -> pd.DataFrame:
     """Read a metrics.csv, one row per logged step."""
-    return pd.read_csv(path).sort_values("step")
+    return read_csv(path, {"step": "iuf"}).sort_values("step")
 
 
 def plot_training_curves(stages: dict[str, Path]) -> Figure:

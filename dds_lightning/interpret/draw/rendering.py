@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 
 from dds_lightning.errors import UserError
 from dds_lightning.interpret.draw.drawing import LABEL, grid, heading, write_title
+from dds_lightning.saving.arrays import read_npz
+from dds_lightning.saving.untrusted import parse_json
 from dds_lightning.tasks import Task, facts_to_keep
 
 BACKENDS = ("egl", "osmesa", "glfw")
@@ -64,8 +66,7 @@ def render_frames(task: Task, qpos: NDArray[Any], width: int = 320, height: int 
         except (subprocess.TimeoutExpired, OSError):
             continue
         if made.returncode == 0 and made.stdout:
-            frames: NDArray[np.uint8] = np.load(io.BytesIO(made.stdout), allow_pickle=False)
-            return frames
+            return read_npz(io.BytesIO(made.stdout))["frames"]
     return None
 
 
@@ -105,10 +106,10 @@ def worker() -> None:
     """Run the separate process: reads the request from standard input, writes an array to standard output."""
     sink = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # whatever a library prints must not land in the array
-    with np.load(io.BytesIO(sys.stdin.buffer.read()), allow_pickle=False) as request:
-        qpos, (width, height), name = request["qpos"], request["size"], str(request["task"])
+    request = read_npz(io.BytesIO(sys.stdin.buffer.read()))
+    qpos, (width, height), name = request["qpos"], request["size"], str(request["task"])
     file = io.BytesIO()
-    np.save(file, _render(name, qpos, int(width), int(height)), allow_pickle=False)
+    np.savez(file, frames=_render(name, qpos, int(width), int(height)))
     sink.write(file.getvalue())
     sink.flush()
     os._exit(0)  # a driver may fail during its clean-up, when its work is done
@@ -122,7 +123,7 @@ def _render(facts: str, qpos: NDArray[np.float64], width: int, height: int) -> N
     from dds_lightning.tasks import restore_task
 
     mujoco.GLContext(16, 16).free()  # without a driver the process ends here, before anything slow
-    task = restore_task(json.loads(facts), "the request")
+    task = restore_task(parse_json(facts, "the request"), "the request")
     assert task is not None, "the caller passes a task"
     with simulator(task) as env:
         model: Any = env.unwrapped.model
