@@ -147,8 +147,8 @@ plot_strobes(task, frames, every=13, title="one second of a medium episode (0) a
 #
 # **Third difference: the amount of training.** The paper's exact settings are shipped (`--preset paper`); according to
 # the paper the skills alone took two and a half hours on an RTX 4090. The preset for this body is designed for two CPU
-# cores (`--preset locomotion`): a budget of 16,000 steps for the skills, which ends earlier where their held-out loss levels
-# off. This notebook uses a fraction of it, at higher learning rates, with one layer less in the encoder and narrower
+# cores (`--preset locomotion`): a budget of 16,000 steps for the skills, which ends earlier where their held-out loss
+# levels off. This notebook uses a fraction of it, at higher learning rates, with one layer less in the encoder and narrower
 # networks in the policy. (Below, a dash stands for the default of the module:
 # two hidden layers of 256.)
 #
@@ -315,9 +315,9 @@ Image(data=clip, format="png")  # a GIF all the same: pages that know only "png"
 # %% [markdown]
 # ## Where it loses
 #
-# Every run ends with a verdict: is there a weak stage, by which number, and what to do about it? A run that reaches nine
-# tenths of the data's best episode needs nothing; the numbers below say how far each stage is from what it could be.
-# Among them is the criterion by which a skill training ends, the fall of held-out loss with a quarter more steps.
+# Every run ends with a verdict: is there a weak stage, by which number, and what to do about it? A run that reaches
+# nine tenths of the data's best episode needs nothing; the numbers below say how far each stage is from what it could
+# be. Among them is the criterion by which a skill training ends, the fall of held-out loss with a quarter more steps.
 
 # %%
 display(Markdown(f"> {told['verdict']['text']}"))
