@@ -148,9 +148,8 @@ plot_strobes(task, frames, every=13, title="one second of a medium episode (0) a
 # **Third difference: the amount of training.** The paper's exact settings are shipped (`--preset paper`); according to
 # the paper the skills alone took two and a half hours on an RTX 4090. The preset for this body is designed for two CPU
 # cores (`--preset locomotion`): a budget of 16,000 steps for the skills, which ends earlier where their held-out loss
-# levels off. This notebook uses a fraction of it, at higher learning rates, with one layer less in the encoder and narrower
-# networks in the policy. (Below, a dash stands for the default of the module:
-# two hidden layers of 256.)
+# levels off. This notebook uses a fraction of it, at higher learning rates, with one layer less in the encoder and
+# narrower networks in the policy. (Below, a dash stands for the default of the module: two hidden layers of 256.)
 #
 # A recipe this small is close to failing, so two things are deliberately different: 32 skills instead of 16, and
 # actions without noise. With 16 skills and 2,500 steps two trials scored 101 and 54. In the second the codes did not
