@@ -307,9 +307,9 @@ checks.round(2)
 # 2. It leaks through thin walls, because a smooth network cannot represent them. At full size three seeds without these
 #    features reach the goal in 0, 0 and 0 % (README): nearly every episode ends pressed against the wall above cell (5,
 #    2), which is close to the goal as the crow flies.
-# 3. With `alpha=0` all weights are 1, so the agent drives as the data do: to anywhere. With `alpha=50` it is
-#    `effective_sample_size` that falls, the share of the rows that weights so unequal amount to, and `clipped_share`
-#    tells how many of them are at their upper bound.
+# 3. With `alpha=0` all weights are 1, and the agent drives as the data do, to anywhere: 10 % of 20 episodes reach the
+#    goal. With `alpha=50` it is 85 %, and `effective_sample_size` is the number: in the last batch the weights count as
+#    much as 12 % of the rows would, and 10 % of them are at their upper bound (`clipped_share`).
 #
 # </details>
 #
