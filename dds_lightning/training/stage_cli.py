@@ -254,7 +254,8 @@ class StageCLI(LightningCLI):
         saved = {"checkpoint": made.checkpoint, "best": made.best}
         lines: list[Any] = [f"{made.steps:,} steps; logs in {made.logs}"]
         lines += [f"{name}: {path}" for name, path in saved.items() if path]
-        stops = [callback for callback in self.trainer.callbacks if isinstance(callback, Convergence)]
+        trainer: Any = self.trainer
+        stops = [callback for callback in trainer.callbacks if isinstance(callback, Convergence)]
         lines += [remark for callback in stops if (remark := callback.remark())]
         return Report({**saved, "steps": made.steps, "metrics": made.metrics, "logs": made.logs}, lines)
 
