@@ -48,7 +48,7 @@ pin-oldest: $(VENV)/.installed  ## rewrite constraints-oldest.txt after changing
 	  >constraints-oldest.tmp
 	mv constraints-oldest.tmp constraints-oldest.txt
 
-faults: $(VENV)/.installed  ## kill every stage at random moments, five minutes
+faults: $(VENV)/.installed  ## kill every stage at random moments, read mutated files; twenty minutes
 	$(BIN)/python -m pytest -s tests/faults
 
 lint: $(VENV)/.installed  ## ruff and mypy, without changing files

@@ -114,7 +114,7 @@ def _d4rl_outline(path: Path) -> dict[str, Any]:
             if key in file
         }
         if missing := {"observations", "actions", "terminals"} - fields.keys():
-            raise DataError(f"{where}: '{min(missing)}' is missing; found {', '.join(file) or 'nothing'}")
+            raise DataError(f"{where}: '{min(missing)}' is missing; found {', '.join(map(str, file)) or 'nothing'}")
         widths = _width(fields["observations"], where), _width(fields["actions"], where)
         first = read_rows(fields["observations"], where, 0, HEAD)
         ends = np.zeros(len(fields["terminals"]), bool)

@@ -207,7 +207,7 @@ def _read(file: h5py.File, where: str, task: Task | None, low: float, high: floa
 
 def _fields(file: h5py.File, where: str, task: Task | None) -> dict[str, h5py.Dataset]:
     """The arrays that are read, checked for type, size and shape; `infos` and `metadata` are never touched."""
-    found = list(file)
+    found = list(map(str, file))
     if found and found[0].startswith("episode_"):
         raise DataError(f"{where}: it has the layout of Minari's files, one group per episode; read it with local:DIR")
     missing = [key for key in FIELDS if key not in found]

@@ -105,7 +105,7 @@ def array_in(group: h5py.Group, key: str, where: str) -> h5py.Dataset:
     Raises:
         DataError: When it is missing, a link, stored elsewhere, or refused by `check_array`.
     """
-    found = list(group)
+    found = list(map(str, group))  # h5py gives bytes for a name that is no text
     if key not in found:
         raise DataError(f"{where}: '{key}' is missing; found {', '.join(found[:8]) or 'nothing'}")
     return check_array(member(group, key, where), f"{where}, {key}")

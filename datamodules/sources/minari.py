@@ -129,7 +129,7 @@ class _Reader:
             Lengths (E,), and the arrays of all episodes end to end, as in `Trajectories`.
         """
         with open_hdf5(self.path, f"data set '{self.name}'", self.path.parent) as file:
-            names = set(file)  # asking the file for a single name would follow links
+            names = set(map(str, file))  # asking the file for a single name would follow links
             labels = [f"episode_{number}" for number in range(len(names))]
             self._check_promise("episodes", episodes, len(labels))
             if not labels:
@@ -188,7 +188,7 @@ class _Reader:
         group = member(file, label, f"data set '{self.name}'")
         if not isinstance(group, h5py.Group):
             raise DataError(f"{where}: got an array, expected a group of {', '.join(FIELDS)}")
-        found = list(group)
+        found = list(map(str, group))
         missing = next((key for key in FIELDS if key not in found), None)
         if missing:
             raise DataError(f"{where}: '{missing}' is missing; found {one_line(', '.join(found)) or 'nothing'}")
@@ -207,7 +207,7 @@ class _Reader:
         return self.layout.flatten(arrays)
 
     def _part(self, group: h5py.Group, key: str, part: Part, where: str) -> NDArray[Any]:
-        found = list(group)
+        found = list(map(str, group))
         if key not in found:
             raise DataError(f"{where}: got the entries {one_line(', '.join(found)) or 'none'}, expected '{key}'")
         node, where = member(group, key, where), f"{where}/{key}"

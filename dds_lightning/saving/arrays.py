@@ -11,8 +11,9 @@ import math
 import struct
 import zipfile
 from collections.abc import Mapping
+from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,20 +73,25 @@ def read_tensors(
             return {name: opened.get_tensor(name) for name in opened.keys()}, metadata  # noqa: SIM118 - not a dict
 
 
-def read_npy(path: str | Path, *, mmap: bool = False, root: str | Path | None = None) -> NDArray[Any]:
-    """Read or map one array.
+def read_npy(path: str | Path | BytesIO, *, mmap: bool = False, root: str | Path | None = None) -> NDArray[Any]:
+    """Read or map one array, of a file or in memory.
 
     Raises:
         UserError: It is refused by `regular_file`, damaged, or holds objects.
     """
-    regular_file(path, None, root)
-    with parsing(path), open(path, "rb") as file:
-        _declared(file, Path(path).stat().st_size, path)
+    with parsing(str(path)):
+        if isinstance(path, BytesIO):
+            _declared(path, path.getbuffer().nbytes, "the array")
+            path.seek(0)
+            return np.load(path, allow_pickle=False)
+        size = regular_file(path, None, root)
+        with open(path, "rb") as file:
+            _declared(file, size, path)
         return np.load(path, mmap_mode="r" if mmap else None, allow_pickle=False)
 
 
 def read_npz(
-    path: str | Path | BinaryIO, largest: int = LARGEST, root: str | Path | None = None, remedy: str = REMEDY
+    path: str | Path | BytesIO, largest: int = LARGEST, root: str | Path | None = None, remedy: str = REMEDY
 ) -> dict[str, NDArray[Any]]:
     """Read every array of an archive, a file or one in memory.
 
@@ -178,7 +184,7 @@ def create_h5(path: str | Path) -> h5py.File:
     return h5py.File(path, "w", libver="v110")
 
 
-def check_archive(file: BinaryIO | Path, size: int) -> None:
+def check_archive(file: Path, size: int) -> None:
     """Refuse an archive whose parts unpack to more than it holds: what is written without packing cannot.
 
     Raises:

@@ -241,6 +241,14 @@ def test_what_is_no_hdf5_is_refused(content: bytes, tmp_path: Path) -> None:
         load_trajectories(f"d4rl:{path}", HOPPER)
 
 
+def test_a_name_that_is_no_text_is_told(tmp_path: Path) -> None:
+    path = write_d4rl_file(tmp_path / "bytes.hdf5", get_task(HOPPER), _recorded(HOPPER))
+    with h5py.File(path, "r+") as file:
+        file.move("rewards", b"rew\xffrds")
+    with pytest.raises(DataError, match=r"'rewards' is missing; found .*rew.xffrds"):
+        load_trajectories(f"d4rl:{path}", HOPPER)
+
+
 def test_a_folder_is_no_file(tmp_path: Path) -> None:
     (tmp_path / "folder.hdf5").mkdir()
     with pytest.raises(DataError, match=r"folder.hdf5 is a folder"):

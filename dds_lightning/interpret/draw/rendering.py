@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from dds_lightning.errors import UserError
 from dds_lightning.interpret.draw.drawing import LABEL, grid, heading, write_title
-from dds_lightning.saving.arrays import read_npz
+from dds_lightning.saving.arrays import read_npy, read_npz
 from dds_lightning.saving.untrusted import parse_json
 from dds_lightning.tasks import Task, facts_to_keep
 
@@ -66,7 +66,7 @@ def render_frames(task: Task, qpos: NDArray[Any], width: int = 320, height: int 
         except (subprocess.TimeoutExpired, OSError):
             continue
         if made.returncode == 0 and made.stdout:
-            return read_npz(io.BytesIO(made.stdout))["frames"]
+            return read_npy(io.BytesIO(made.stdout))
     return None
 
 
@@ -109,7 +109,7 @@ def worker() -> None:
     request = read_npz(io.BytesIO(sys.stdin.buffer.read()))
     qpos, (width, height), name = request["qpos"], request["size"], str(request["task"])
     file = io.BytesIO()
-    np.savez(file, frames=_render(name, qpos, int(width), int(height)))
+    np.save(file, _render(name, qpos, int(width), int(height)), allow_pickle=False)
     sink.write(file.getvalue())
     sink.flush()
     os._exit(0)  # a driver may fail during its clean-up, when its work is done
