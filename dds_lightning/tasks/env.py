@@ -45,14 +45,31 @@ def open_env(task: Task) -> Iterator[gym.Env[Flat, Flat]]:
         env.close()
 
 
-class TaskEnv(gym.Wrapper[Flat, Flat, Any, Any]):
+class TaskEnv(gym.Wrapper[Flat, Flat, Any, Any], gym.utils.RecordConstructorArgs):
     """An environment whose observations are already flat, and which reports `success` itself or not at all."""
 
     def __init__(self, env: gym.Env[Any, Any], task: Task) -> None:
         """Wrap `env`, which must come from `build_env`."""
-        super().__init__(env)
+        gym.utils.RecordConstructorArgs.__init__(self, task=task, _disable_deepcopy=True)  # `spec` makes it again
+        gym.Wrapper.__init__(self, env)
         self.task = task
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (task.observation_dim,), np.float32)
+
+    @property
+    def unwrapped(self) -> gym.Env[Any, Any]:
+        """The simulator's environment; this one where that takes goals, for this one does not.
+
+        Whoever looks for `compute_reward` to recognise an environment with goals (stable-baselines3's HER) would
+        expect a goal in the observations. All other attributes of the simulator's environment can be read here.
+        """
+        inner = self.env.unwrapped
+        return self if hasattr(inner, "compute_reward") else inner
+
+    def __getattr__(self, name: str) -> Any:
+        """Return an attribute of the simulator's environment, see `unwrapped`."""
+        if name in ("compute_reward", "env") or name.startswith("__"):
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+        return getattr(self.env.unwrapped, name)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Flat, dict[str, Any]]:
         """Start an episode."""
