@@ -32,7 +32,7 @@ ROOMS = {
     "dds_lightning.module": "errors finetune nn saving",
     "dds_lightning.skill": "errors module nn",
     "dds_lightning.policy": "errors losses module nn",
-    "dds_lightning.agent": "errors policy saving skill",
+    "dds_lightning.agent": "envs errors policy saving skill",
     "dds_lightning.rollout": "console errors envs saving tasks",
     # the data
     "datamodules.validation": "errors",
