@@ -254,7 +254,7 @@ def test_it_acts_in_a_plain_gymnasium_environment():
 @pytest.mark.parametrize(
     ("observations", "settings", "message"),
     [
-        (np.zeros((2, 5)), {}, r"observations are \(2, 5\), expected \(2, 4\)"),
+        (np.zeros((2, 5)), {}, r"observations are \(2, 5\), expected \(environments, 4\)"),
         (np.zeros((3, 4)), {}, "3 observations for 2 environments"),
         (np.zeros((2, 1, 4)), {}, r"observations are \(2, 1, 4\)"),
         (np.zeros((2, 4)), {"restarted": np.ones(3, bool)}, r"restarted is \(3,\)"),

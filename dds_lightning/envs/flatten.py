@@ -33,9 +33,7 @@ def numbers(observations: Any) -> NDArray[np.float32]:
     except (TypeError, ValueError):
         kind = type(observations).__name__
         pair = ": reset returns them and a dictionary, give the first" if isinstance(observations, tuple) else ""
-        raise UserError(
-            f"observations are a {kind}, expected an array of numbers{pair}"
-        ) from None
+        raise UserError(f"observations are a {kind}, expected an array of numbers{pair}") from None
     if not np.isfinite(array).all():
         place = np.argwhere(~np.isfinite(array))[0]
         raise UserError(
