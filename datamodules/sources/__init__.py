@@ -15,7 +15,7 @@ from datamodules.sources.source import Source
 from datamodules.sources.subtasks import relabel_subtasks
 from datamodules.trajectories import DataError, Trajectories
 from dds_lightning.errors import UserError
-from dds_lightning.tasks import Task, get_task, task_for_env
+from dds_lightning.tasks import Task, get_task, is_own, remember, task_for_env
 
 SOURCES: dict[str, Source] = {"local": LOCAL, "minari": MINARI, "arrays": ARRAYS, "d4rl": D4RL}
 """What stands before the colon -> the source."""
@@ -45,6 +45,8 @@ def resolve_task(spec: str, task: Task | str) -> Task:
         DataError: For data of another task.
     """
     task = get_task(task)
+    if is_own(task):
+        remember(task)  # the reader accepts recordings of its environment
     source, rest = parse_spec(spec)
     env_id = source.recorded_in(rest)
     if env_id is None:

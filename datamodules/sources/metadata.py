@@ -29,7 +29,7 @@ from dds_lightning.envs.kitchen import SUBTASKS
 from dds_lightning.errors import UserError
 from dds_lightning.saving.files import neighbours
 from dds_lightning.saving.untrusted import parse_json, read_text
-from dds_lightning.tasks import Task, known_env_ids
+from dds_lightning.tasks import Task, is_own, known_env_ids
 
 MAX_BYTES = 2**20
 """Greatest size of a metadata.json; genuine ones have a few thousand bytes."""
@@ -144,7 +144,7 @@ def _registered(name: str, env_id: Any) -> Any:
     if not isinstance(env_id, str) or env_id not in known_env_ids():
         raise DataError(
             f"data set '{name}': it was recorded in {_short(env_id)}, which no task uses; see `dds tasks`, or, for a "
-            "robot of your own, write the data without an environment (no env_spec in metadata.json) or give arrays:DIR"
+            "robot of your own, give its task with --task, a file that names this environment"
         )
     import gymnasium as gym  # slow, and not needed for data sets that are refused earlier
 
@@ -191,6 +191,8 @@ def check_task(metadata: dict[str, Any], task: Task) -> None:
         DataError: When the recording is not of the task.
     """
     name, env = metadata["dataset_id"], metadata["env_spec"]
+    if env is None and is_own(task):
+        return
     if env is None:
         raise DataError(
             f"data set '{name}': metadata.json has no env_spec, so nothing says that it was recorded in "

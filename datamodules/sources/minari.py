@@ -212,8 +212,8 @@ class _Reader:
             raise DataError(f"{where}: got the entries {one_line(', '.join(found)) or 'none'}, expected '{key}'")
         node, where = member(group, key, where), f"{where}/{key}"
         array = check_array(node, where)
-        if len(array.shape) != 2 or array.shape[1] not in part.widths:
-            expected = " or ".join(f"(steps, {width})" for width in part.widths)
+        if len(array.shape) != 2 or array.shape[1] not in (part.widths or array.shape[1:]):
+            expected = " or ".join(f"(steps, {width})" for width in part.widths) or "(steps, width)"
             raise DataError(f"{where}: got shape {array.shape}, expected {expected}")
         self._count(array.nbytes)
         return read_rows(array, where, 0, len(array), part.columns)

@@ -118,9 +118,9 @@ def task_for_env(task: Task, env_id: str) -> Task | None:
 
 
 def known_env_ids() -> frozenset[str]:
-    """Every environment whose recordings some task accepts, in any variant."""
-    everything = [one for task in ROWS for one in (task, *map(task.variant, task.variants))]
-    return frozenset(env_id for task in everything for env_id in (task.env_id, *task.data_env_ids))
+    """Every environment whose recordings some task accepts, in any variant; custom tasks that were read included."""
+    everything = [one for task in (*ROWS, *_OWN.values()) for one in (task, *map(task.variant, task.variants))]
+    return frozenset(name for task in everything for name in (task.env_id.rpartition(":")[2], *task.data_env_ids))
 
 
 def task_table() -> pd.DataFrame:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dds_lightning.envs.build import build_env
+from dds_lightning.envs.flatten import flatten
 from dds_lightning.envs.kitchen import goal_vector, kitchen_layout
 from dds_lightning.tasks.bodies import body_of
 
@@ -46,7 +47,7 @@ def open_env(task: Task) -> Iterator[gym.Env[Flat, Flat]]:
 
 
 class TaskEnv(gym.Wrapper[Flat, Flat, Any, Any], gym.utils.RecordConstructorArgs):
-    """An environment whose observations are already flat, and which reports `success` itself or not at all."""
+    """An environment whose observations are one array or a dictionary of them, with or without `success` in `info`."""
 
     def __init__(self, env: gym.Env[Any, Any], task: Task) -> None:
         """Wrap `env`, which must come from `build_env`."""
@@ -84,12 +85,13 @@ class TaskEnv(gym.Wrapper[Flat, Flat, Any, Any], gym.utils.RecordConstructorArgs
 
     def _outside(self, observation: Any, info: dict[str, Any]) -> tuple[Flat, dict[str, Any]]:
         """Return the observation for the agent and the `info` for the caller."""
-        info["success"] = bool(info.get("success", False))
+        info["success"] = bool(info.get("success", info.get("is_success", False)))
         return np.asarray(self.flatten(observation), dtype=np.float32), info
 
     def flatten(self, observation: Any) -> Any:
         """The task's flat observation, (O,)."""
-        return observation
+        keys = self.task.observation_keys
+        return flatten(observation, keys) if keys else observation
 
 
 class MazeEnv(TaskEnv):

@@ -37,6 +37,8 @@ class Task:
         max_episode_steps: Steps after which an evaluation episode is truncated.
         step_seconds: Simulated seconds per step.
         env_options: Further arguments to the environment's constructor.
+        observation_keys: Entries of a dictionary observation that are put end to end, in this order; one of them may
+            be the goal. Empty where the observation is one array.
         adapter: How the environment's observations are flattened: "flat" takes them as they are, "maze" and
             "kitchen" read gymnasium-robotics' dictionaries.
         physics: Name of this variant; "" if there is only one.
@@ -80,6 +82,7 @@ class Task:
     action_low: float = -1.0
     action_high: float = 1.0
     env_options: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    observation_keys: tuple[str, ...] = ()
     adapter: Literal["flat", "maze", "kitchen"] = "flat"
     physics: str = ""
     variants: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, hash=False, repr=False)
@@ -131,7 +134,7 @@ class Task:
 
     def accepts(self, env_id: str) -> bool:
         """Whether recordings from an environment fit this task without changes."""
-        return env_id == self.env_id or env_id in self.data_env_ids
+        return env_id == self.env_id.rpartition(":")[2] or env_id in self.data_env_ids
 
     # ------------------------------------------------------------------ geometry
 
