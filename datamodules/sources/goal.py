@@ -15,7 +15,8 @@ def relabel_to_goal(trajectories: Trajectories, task: Task) -> Trajectories:
 
     `r_t = 1` if the position after step t lies within `goal_radius` of the goal, else 0. Reaching the goal
     ends the episode (termination); what follows becomes a new episode that starts outside it, see
-    `cut_at_goal`. Terminations of other goals become truncations: for this task nothing ended there.
+    `cut_at_goal`. Terminations of other goals become truncations: for this task nothing ended there. A task with
+    `goal_noise` draws a goal for every episode, always the same ones, from D4RL's distribution.
 
     Args:
         trajectories: Positions are the first two columns of the observations.
@@ -24,8 +25,12 @@ def relabel_to_goal(trajectories: Trajectories, task: Task) -> Trajectories:
     Raises:
         DataError: When every recorded state lies on the goal, so that nothing is left.
     """
-    inside = np.linalg.norm(trajectories.observations[:, :2] - task.goal_xy(), axis=1) <= task.goal_radius
-    return _cut(trajectories, inside)
+    goals = np.tile(task.goal_xy(), (trajectories.num_episodes, 1))
+    if task.goal_noise:
+        longer, shorter = np.random.default_rng(0).uniform(0.0, task.goal_noise, (2, *goals.shape))
+        goals += (4 * longer + 2 * shorter) / 3 - task.goal_noise  # U(0, 4/3 noise) + U(0, 2/3 noise) from the centre
+    away = trajectories.observations[:, :2] - np.repeat(goals, trajectories.lengths + 1, axis=0)
+    return _cut(trajectories, np.linalg.norm(away, axis=1) <= task.goal_radius)
 
 
 def cut_at_arrivals(trajectories: Trajectories, task: Task) -> Trajectories:

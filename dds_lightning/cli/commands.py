@@ -80,7 +80,7 @@ def run(
     return run_all(
         RunSettings.with_preset(
             task=task,
-            out=Path(out or f"runs/{get_task(task).name}"),
+            out=Path(out or f"runs/{get_task(task).file_name}"),
             data=data_spec(data) if data else None,
             seed=seed,
             preset=preset,

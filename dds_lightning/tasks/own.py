@@ -11,6 +11,9 @@ Other attributes of a `Task` are optional; if not given, widths and action bound
 its observations are a dictionary, `observation_keys` says which entries are put end to end, in which order:
 `[observation, desired_goal]` shows the goal to the agent, `[observation]` does not. `action_low` and `action_high` are
 the bounds of actions, `measures_success: true` counts episodes whose `info` says `success` or `is_success`.
+A file may also give a maze of the table another goal or start cell: `task: pointmaze-large-diverse` with
+`goal: [7, 1]` or `start: [1, 1]`, (row, column), is what `pointmaze-large-diverse?goal=7,1` is on the command line.
+
 `positions` and `velocities` say which observations are the simulator's qpos and qvel, which `dds data check --replay`
 needs.
 """
@@ -72,12 +75,15 @@ def is_address(name: str) -> bool:
     return name.endswith((".yaml", ".yml")) or re.fullmatch(r"[\w.]+:\w+", name) is not None
 
 
-def load_task(address: str) -> Task:
-    """Read a task from a YAML file or from a Python module.
+def load_task(address: str) -> Task | str:
+    """Read a task from a YAML file or from a Python module; a file may also change the cells of a task of the table.
 
     Args:
         address: Path that ends in `.yaml`, or `package.module:NAME` of a `Task`; the module is imported, which executes
             its code.
+
+    Returns:
+        The task, or the name of one, `NAME?goal=ROW,COLUMN`.
 
     Raises:
         UserError: It cannot be read or is not a task; the message names the field, its value and what was expected.
@@ -92,7 +98,18 @@ def load_task(address: str) -> Task:
     given = read_yaml(path, LARGEST, verdict="is not valid YAML", remedy="mend it")
     if not isinstance(given, dict):
         raise UserError(f"task: {path} is not a mapping, expected for example env_id: Reacher-v5")
-    return build_task({"name": path.stem, **given}, str(path))
+    return _cells(given, str(path)) if "task" in given else build_task({"name": path.stem, **given}, str(path))
+
+
+def _cells(given: Mapping[str, Any], where: str) -> str:
+    """Return the name that a file with `task`, and `start` or `goal` or both, stands for."""
+    found = {which: given[which] for which in ("start", "goal") if given.get(which) is not None}
+    if unknown := set(given) - {"task", "start", "goal"}:
+        raise UserError(f"task: {where} sets task and {min(unknown)}; beside a task it may set start and goal")
+    for which, cell in found.items():
+        if not isinstance(cell, list) or len(cell) != 2 or not all(type(i) is int and i >= 0 for i in cell):
+            raise UserError(f"task: {where} sets {which} to {cell!r}, expected a cell, [row, column]")
+    return f"{given['task']}?{'&'.join(f'{which}={i},{j}' for which, (i, j) in found.items())}"
 
 
 def definition(task: Task) -> dict[str, Any]:
