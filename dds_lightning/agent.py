@@ -106,8 +106,8 @@ class DDSAgent(nn.Module):
             if learnt_with and learnt_with != (found := self.skill.fingerprint()):
                 raise UserError(
                     f"the policy was trained on the codes of skill model {short(learnt_with)}, this one is "
-                    f"{short(found)}: they do not belong together; give the skill checkpoint that the policy "
-                    "was trained with"
+                    f"{short(found)}: they do not belong together; give the skills that the policy was trained with, "
+                    "or train a policy on these with `dds policy fit --data.skill SKILL.ckpt`"
                 )
 
     # ---------------------------------------------------------------- acting

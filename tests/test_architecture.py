@@ -69,8 +69,8 @@ ROOMS = {
     "datamodules.inspection datamodules.trajectories",
     "dds_lightning.interpret.atlas": "interpret.draw interpret.measure interpret.views rollout saving tasks "
     "datamodules.trajectories",
-    "dds_lightning.study": "agent callbacks console errors interpret.atlas interpret.draw interpret.measure rollout "
-    "saving skill tasks datamodules.collect datamodules.relabel datamodules.relabelling datamodules.sources",
+    "dds_lightning.study": "agent callbacks console errors interpret.atlas interpret.draw interpret.measure policy "
+    "rollout saving skill tasks datamodules.collect datamodules.relabel datamodules.relabelling datamodules.sources",
     "dds_lightning.sharing": "agent errors saving tasks training",
     "dds_lightning.pipeline": "agent baselines configs console errors policy rollout saving skill study tasks training "
     "datamodules.collect datamodules.inspection datamodules.relabelled datamodules.relabelling datamodules.relabel "

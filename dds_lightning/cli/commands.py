@@ -135,7 +135,9 @@ def relabel(
 
 
 def evaluate(
-    directory: str,
+    directory: str | None = None,
+    skill: str | None = None,
+    policy: str | None = None,
     task: str | None = None,
     episodes: int | None = None,
     selection: list[str] = ["greedy", "sample"],  # noqa: B006
@@ -159,7 +161,9 @@ def evaluate(
     What is not measured is null.
 
     Args:
-        directory: A run of `dds run`, or a published checkpoint.
+        directory: A run of `dds run`, or a published checkpoint; left out with --skill.
+        skill: Skill checkpoint (.ckpt) of `dds skill fit` instead of a run.
+        policy: Policy checkpoint (.ckpt) of `dds policy fit` to go with it.
         task: Name of the task; without it the one the agent was made for.
         episodes: Episodes for each way of choosing skills; without it the task's default.
         selection: How skills are chosen: greedy, sample, argmax_q, random; several give one row each.
@@ -173,7 +177,9 @@ def evaluate(
     from dds_lightning.study.evaluate import evaluate as play
 
     return play(
-        Path(directory),
+        None if directory in (None, "-") else Path(str(directory)),
+        skill=skill,
+        policy=policy,
         task=task,
         episodes=episodes,
         selection=selection,
