@@ -7,7 +7,7 @@ from typing import Any
 import docstring_parser
 from jsonargparse import ArgumentParser
 
-from dds_lightning.cli import atlas, checkpoints, commands, data
+from dds_lightning.cli import atlas, checkpoints, commands, data, record
 from dds_lightning.console.arguments import as_lists, list_options
 from dds_lightning.errors import UserError
 from dds_lightning.training.stages import STAGES
@@ -38,6 +38,7 @@ def command_table() -> Commands:
         "evaluate": commands.evaluate,
         "report": commands.report,
         "atlas": atlas.atlas,
+        "record": record.record,
         "data": {
             "list": data.list_,
             "show": data.show,

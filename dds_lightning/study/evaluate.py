@@ -62,7 +62,7 @@ def evaluate(
         for kind, place in places.items()
     }
     for kind, agent in agents.items():
-        _refuse_other_task(agent, places[kind], wanted)
+        refuse_other_task(agent, places[kind], wanted)
     best = _best_facts(places[BEST]) if BEST in places else None
     players: list[Contestant] = []
     shown: dict[str, str] = {}
@@ -114,7 +114,12 @@ def _places(directory: Path, checkpoint: str) -> dict[str, Path]:
     return {checkpoint: places[checkpoint]}
 
 
-def _refuse_other_task(agent: DDSAgent, path: Path, task: Task) -> None:
+def refuse_other_task(agent: DDSAgent, path: Path, task: Task) -> None:
+    """Refuse an agent whose widths are not the task's.
+
+    Raises:
+        UserError: It was trained for another task.
+    """
     found, expected = (agent.observation_dim, agent.action_dim), (task.observation_dim, task.action_dim)
     if found != expected:
         raise UserError(

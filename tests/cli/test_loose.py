@@ -126,3 +126,19 @@ def test_the_task_that_a_checkpoint_names_is_never_opened(trained, tmp_path, cap
     assert main(["evaluate", "--skill", str(tmp_path / "evil.ckpt"), "--selection", "random"]) == 2
     assert f"was trained for task {tmp_path / 'evil.yaml'}: give --task=" in told(capsys.readouterr().err)
     assert get_task(TASK).goal_cell == (1, 3)
+
+
+def test_an_agent_is_recorded_in_its_task_and_what_cannot_be_is_refused(trained, capsys, tmp_path, monkeypatch):
+    skill, policy, _ = trained
+    assert call("publish", "-", tmp_path / "agent", "--skill", skill, "--policy", policy) == 0
+    found = answer(capsys, "record", tmp_path / "agent", "--episodes", 2, "--out", tmp_path / "film.gif")
+    assert (found["task"], found["pictures"], [row["steps"] for row in found["results"]]) == (TASK, "drawn", [300, 300])
+    assert (tmp_path / "film.gif").read_bytes()[:3] == b"GIF"
+    for words, message in (
+        ([tmp_path / "agent", "--out", tmp_path / "film.avi"], "expected a name that ends in .mp4 or .gif"),
+        ([tmp_path / "agent", "--episodes", 0], "--episodes is 0, expected at least 1"),
+        ([tmp_path / "nowhere"], "there is no folder"),
+        ([tmp_path / "agent", "--task", "hopper-medium"], r"it was trained for another task"),
+    ):
+        assert main(["record", *map(str, words)]) == 2
+        assert message in told(capsys.readouterr().err)
