@@ -5,7 +5,10 @@ A new source is one `Source` record in a file of its own and one entry of `SOURC
 
 from __future__ import annotations
 
-from typing import Literal
+import contextlib
+from collections.abc import Iterator
+from functools import partial
+from typing import Any, Literal
 
 from datamodules.sources.arrays import ARRAYS
 from datamodules.sources.d4rl import D4RL
@@ -34,6 +37,17 @@ def parse_spec(spec: str) -> tuple[Source, str]:
     return SOURCES[name], rest
 
 
+@contextlib.contextmanager
+def _remedy(source: Source) -> Iterator[None]:
+    """Add to a refusal of data what helps, unless it has said so after a semicolon."""
+    try:
+        yield
+    except DataError as error:
+        if "; " in str(error):
+            raise
+        raise DataError(f"{error}; {source.again}") from error
+
+
 def resolve_task(spec: str, task: Task | str) -> Task:
     """The variant of a task in which the data were recorded.
 
@@ -48,7 +62,8 @@ def resolve_task(spec: str, task: Task | str) -> Task:
     if is_own(task):
         remember(task)  # the reader accepts recordings of its environment
     source, rest = parse_spec(spec)
-    env_id = source.recorded_in(rest)
+    with _remedy(source):
+        env_id = source.recorded_in(rest)
     if env_id is None:
         return task
     found = task_for_env(task, env_id)
@@ -89,8 +104,10 @@ def load_trajectories(
         raise UserError(f"reward: got '{reward}', expected 'task' or 'recorded'")
     source, rest = parse_spec(spec)
     task = resolve_task(spec, task) if task is not None else None
-    trajectories = source.load(rest, task)
+    with _remedy(source):
+        trajectories = source.load(rest, task)
     if task is not None and reward == "task" and task.data_reward != "environment":
-        relabel = {"goal": relabel_to_goal, "arrival": cut_at_arrivals, "subtasks": relabel_subtasks}[task.data_reward]
+        to_goal = partial(relabel_to_goal, drawn=task.goal_noise > 0)
+        relabel: Any = {"goal": to_goal, "arrival": cut_at_arrivals, "subtasks": relabel_subtasks}[task.data_reward]
         trajectories = relabel(trajectories, task)
     return trajectories.for_task(task)

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.sources.observations import Layout, box_shape, describe_space, find_layout, task_layout
+from datamodules.sources.source import FIT
 from datamodules.validation import DataError
 from dds_lightning.envs.kitchen import SUBTASKS
 from dds_lightning.errors import UserError
@@ -196,7 +197,7 @@ def check_task(metadata: dict[str, Any], task: Task) -> None:
     if env is None:
         raise DataError(
             f"data set '{name}': metadata.json has no env_spec, so nothing says that it was recorded in "
-            f"{task.env_id}, which task '{task.name}' needs"
+            f"{task.env_id}, which task '{task.name}' needs; write its env_spec, or give the arrays as arrays:DIR"
         )
     maze_map = env["kwargs"].get("maze_map")
     if task.maze_map is not None and maze_map is not None:
@@ -204,7 +205,7 @@ def check_task(metadata: dict[str, Any], task: Task) -> None:
         if walls != task.maze_map:
             raise DataError(
                 f"data set '{name}' was recorded in {env['id']} with other walls ({one_line('/'.join(walls))}) than "
-                f"task '{task.name}' has ({'/'.join(task.maze_map)})"
+                f"task '{task.name}' has ({'/'.join(task.maze_map)}); {FIT}"
             )
     recorded = env["kwargs"].get("tasks_to_complete")
     if task.subtasks and recorded is not None and set(recorded) != set(task.subtasks):
@@ -235,7 +236,7 @@ def observation_layout(metadata: dict[str, Any], task: Task | None) -> Layout:
     subtasks = (env or {"kwargs": {}})["kwargs"].get("tasks_to_complete", list(SUBTASKS))
     layout = task_layout(task) if task else find_layout(space, subtasks)
     if layout is None or not layout.fits(space):
-        needed = f"task '{task.name}' needs {layout}" if task else "no task has such a space"
+        needed = f"task '{task.name}' needs {layout}; {FIT}" if task else "no task has such a space; give a --task file"
         found = one_line(describe_space(space))
         raise DataError(f"data set '{metadata['dataset_id']}': its observation space is {found}, but {needed}")
     return layout
@@ -269,7 +270,7 @@ def action_box(metadata: dict[str, Any], task: Task | None) -> tuple[NDArray[np.
     if low.shape != needed[0].shape or not np.allclose([low, high], needed):
         raise DataError(
             f"{where} is a Box ({len(low)},) from {low.min():g} to {high.max():g}, but task '{task.name}' needs a Box "
-            f"({task.action_dim},) from {task.action_low:g} to {task.action_high:g}"
+            f"({task.action_dim},) from {task.action_low:g} to {task.action_high:g}; {FIT}"
         )
     return needed
 

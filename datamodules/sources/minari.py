@@ -318,6 +318,7 @@ LOCAL = Source(
     load=load_local,
     locate=lambda directory: Path(directory).expanduser(),
     open_rows=open_local,
+    again="collect or download the data set again",
     recorded_in=local_env_id,
 )
 
@@ -327,6 +328,7 @@ MINARI = Source(
     load=lambda dataset_id, task: load_local(minari_folder(dataset_id), task),
     locate=lambda dataset_id: minari_root() / check_minari_id(dataset_id),
     open_rows=lambda dataset_id, task, rng: open_local(minari_folder(dataset_id), task, rng),
+    again=LOCAL.again,
     recorded_in=lambda dataset_id: local_env_id(minari_folder(dataset_id)),
 )
 """`local` under a folder that the id names."""

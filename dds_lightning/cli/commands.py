@@ -228,7 +228,7 @@ def data_check(data: str, task: str | None = None, horizon: int | None = None, r
         facts = check_dataset(spec, task, horizon=horizon)
         return Report(
             {"data": spec, "task": task, "sound": True, "facts": facts, "replay": None},
-            [_facts(facts), f"{spec} is sound" + (f" and fits {task}" if task else "")],
+            [_facts(facts), *_repeats(facts), f"{spec} is sound" + (f" and fits {task}" if task else "")],
         )
     if task is None:
         raise UserError("--replay needs an environment: give --task NAME; `dds tasks` lists them")
@@ -239,7 +239,12 @@ def data_check(data: str, task: str | None = None, horizon: int | None = None, r
     facts = check_dataset(spec, found.task if found.fit else None, horizon=horizon)
     return Report(
         {"data": spec, "task": found.task.name, "sound": True, "facts": facts, "replay": found.facts()},
-        [_facts(facts), table(found.table().head(12), f"{found.steps} steps in {found.task.name}"), *found.lines()],
+        [
+            _facts(facts),
+            *_repeats(facts),
+            table(found.table().head(12), f"{found.steps} steps in {found.task.name}"),
+            *found.lines(),
+        ],
         status=0 if found.fit else 1,
     )
 
@@ -269,6 +274,15 @@ def tasks(name: str | None = None) -> Report:
             "`dds tasks NAME` shows everything about one task, including its maze and its data.",
         ],
     )
+
+
+def _repeats(facts: dict[str, object]) -> list[str]:
+    """A line about identical episodes, if there are any."""
+    count = facts.get("repeated episodes")
+    told = (
+        f"{count} of the {facts['episodes']} episodes repeat an earlier one to the bit: training and validation would "
+    )
+    return [told + "share them, and held-out losses mean little; leave the repeats out"] if count else []
 
 
 def _facts(facts: dict[str, object]) -> str:
