@@ -189,8 +189,11 @@ def stage_of(checkpoint: Mapping[str, Any]) -> str | None:
 
 def trained_for(checkpoint: Mapping[str, Any]) -> str | None:
     """The name of the task that a checkpoint was trained for; None where nothing says it."""
-    told = (checkpoint.get(SETTINGS_KEY) or {}).get("data.task")
-    return told or (checkpoint.get("datamodule_hyper_parameters") or {}).get("task")
+    for entry, name in ((SETTINGS_KEY, "data.task"), ("datamodule_hyper_parameters", "task")):
+        settings = checkpoint.get(entry)
+        if isinstance(settings, Mapping) and isinstance(settings.get(name), str):
+            return str(settings[name])
+    return None
 
 
 def _write(checkpoint: dict[str, Any], path: Path) -> None:

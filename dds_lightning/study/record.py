@@ -10,7 +10,7 @@ import pandas as pd
 
 from dds_lightning.agent import DDSAgent
 from dds_lightning.console.reports import Report, table
-from dds_lightning.errors import UserError
+from dds_lightning.errors import UserError, lacks_extra
 from dds_lightning.interpret.draw.video import SUFFIXES, Footage, episode_pictures, write_video
 from dds_lightning.rollout.result import RolloutPath
 from dds_lightning.rollout.schedule import episode_seed
@@ -47,7 +47,7 @@ def record(
     if how == "drawn":
         lines.append("drawn, not rendered: where a graphics driver is, MUJOCO_GL=egl, osmesa or glfw names it")
     if path != out:
-        lines.append("nothing encodes MP4 here: run `pip install -e '.[video]' -c constraints.txt` in the checkout")
+        lines.append(str(lacks_extra("nothing encodes MP4 here", "video")))
     return Report({"file": path, "task": wanted.name, "seed": seed, "pictures": how, "results": shown}, lines)
 
 
