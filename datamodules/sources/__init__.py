@@ -6,6 +6,7 @@ A new source is one `Source` record in a file of its own and one entry of `SOURC
 from __future__ import annotations
 
 import contextlib
+import warnings
 from collections.abc import Iterator
 from functools import partial
 from typing import Any, Literal
@@ -110,4 +111,10 @@ def load_trajectories(
         to_goal = partial(relabel_to_goal, drawn=task.goal_noise > 0)
         relabel: Any = {"goal": to_goal, "arrival": cut_at_arrivals, "subtasks": relabel_subtasks}[task.data_reward]
         trajectories = relabel(trajectories, task)
+        if "?" in task.name and not trajectories.terminations.any():
+            warnings.warn(
+                f"data '{spec}': no episode reaches the goal of {task.name}, so nothing rewards it; collect data "
+                "that do, or choose another goal",
+                stacklevel=2,
+            )
     return trajectories.for_task(task)

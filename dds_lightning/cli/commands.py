@@ -50,7 +50,8 @@ def run(
     measured is null.
 
     Args:
-        task: Name of a task (`dds tasks` lists them), a task file of your own (.yaml), or package.module:NAME.
+        task: Name of a task (`dds tasks` lists them), a task file of your own (.yaml), or package.module:NAME; in mazes
+            `NAME?goal=ROW,COLUMN`, `?start=ROW,COLUMN` or both, joined by &.
         out: Folder of the run; without it runs/TASK.
         data: Your data, local:DIR, minari:ID, d4rl:FILE or arrays:DIR; without it data are collected in the
             environment.
@@ -253,7 +254,8 @@ def tasks(name: str | None = None) -> Report:
     """List the tasks, or show everything about one: environment, episodes, maze, rewards, scores, data.
 
     Args:
-        name: Name of one task or of one of its variants, for example antmaze-umaze@robotics.
+        name: Name of one task or of one of its variants, for example antmaze-umaze@robotics, or a maze with another
+            goal, for example 'antmaze-umaze?goal=1,3'.
     """
     from dds_lightning.tasks import get_task, task_names, task_table
     from dds_lightning.tasks.facts import draw_maze, task_facts, task_lines

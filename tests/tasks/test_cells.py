@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from datamodules.sources import load_trajectories
 from datamodules.sources.goal import relabel_to_goal
 from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError
@@ -108,3 +109,13 @@ def test_rewards_of_the_data_are_those_of_the_new_goal(name):
     else:
         assert reached == 1.0
         assert away.max() <= task.goal_radius
+
+
+def test_data_that_never_reach_the_goal_say_so(tmp_path):
+    last = np.arange(3) == 2
+    flags = {"terminations": last & False, "truncations": last}
+    fields = {"observations": np.zeros((4, 4)), "actions": np.zeros((3, 2)), "rewards": np.ones(3), **flags}
+    folder = Trajectories.from_episodes("still", [fields]).save(tmp_path / "still")
+    with pytest.warns(UserWarning, match=r"no episode reaches the goal of pointmaze-umaze-play\?goal=1,3"):
+        data = load_trajectories(f"arrays:{folder}", "pointmaze-umaze-play?goal=1,3")
+    assert data.rewards.sum() == 0
