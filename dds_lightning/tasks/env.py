@@ -52,8 +52,8 @@ class TaskEnv(gym.Wrapper[Flat, Flat, Any, Any], gym.utils.RecordConstructorArgs
     def __init__(self, env: gym.Env[Any, Any], task: Task) -> None:
         """Wrap `env`, which must come from `build_env`."""
         gym.utils.RecordConstructorArgs.__init__(self, task=task, _disable_deepcopy=True)  # `spec` makes it again
-        gym.Wrapper.__init__(self, env)
         self.task = task
+        gym.Wrapper.__init__(self, env)
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (task.observation_dim,), np.float32)
 
     @property
@@ -61,7 +61,7 @@ class TaskEnv(gym.Wrapper[Flat, Flat, Any, Any], gym.utils.RecordConstructorArgs
         """The simulator's environment; this one where that takes goals, for this one does not.
 
         Whoever looks for `compute_reward` to recognise an environment with goals (stable-baselines3's HER) would
-        expect a goal in the observations. All other attributes of the simulator's environment can be read here.
+        expect a goal in the observations. All other attributes of the simulator's environment are read and set here.
         """
         inner = self.env.unwrapped
         return self if hasattr(inner, "compute_reward") else inner
@@ -71,6 +71,12 @@ class TaskEnv(gym.Wrapper[Flat, Flat, Any, Any], gym.utils.RecordConstructorArgs
         if name in ("compute_reward", "env") or name.startswith("__"):
             raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
         return getattr(self.env.unwrapped, name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set an attribute, of the simulator's environment if that has it and this one does not."""
+        inner = self.env.unwrapped if "env" in vars(self) else self
+        own = name in vars(self) or hasattr(type(self), name) or not hasattr(inner, name)
+        object.__setattr__(self if own else inner, name, value)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Flat, dict[str, Any]]:
         """Start an episode."""

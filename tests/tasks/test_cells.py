@@ -114,7 +114,8 @@ def test_rewards_of_the_data_are_those_of_the_new_goal(name):
 def test_data_that_never_reach_the_goal_say_so(tmp_path):
     last = np.arange(3) == 2
     flags = {"terminations": last & False, "truncations": last}
-    fields = {"observations": np.zeros((4, 4)), "actions": np.zeros((3, 2)), "rewards": np.ones(3), **flags}
+    states = np.tile([*get_task("pointmaze-umaze-play").start_xy(), 0, 0], (4, 1))
+    fields = {"observations": states, "actions": np.zeros((3, 2)), "rewards": np.ones(3), **flags}
     folder = Trajectories.from_episodes("still", [fields]).save(tmp_path / "still")
     with pytest.warns(UserWarning, match=r"no episode reaches the goal of pointmaze-umaze-play\?goal=1,3"):
         data = load_trajectories(f"arrays:{folder}", "pointmaze-umaze-play?goal=1,3")

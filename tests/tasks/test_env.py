@@ -45,6 +45,11 @@ def test_the_simulator_is_reached_through_an_environment_without_goals():
     assert not hasattr(env.unwrapped, "compute_reward")
     assert env.unwrapped.point_env.model.nq == 2
     np.testing.assert_array_equal(env.unwrapped.goal, get_task("pointmaze-umaze-play").goal_xy())
+    env.unwrapped.reward_type = "dense"  # what users change there must reach it
+    assert env.env.unwrapped.reward_type == "dense"
+    assert "reward_type" not in vars(env)
+    env.own = env.unwrapped.own = 3
+    assert not hasattr(env.env.unwrapped, "own")
     with pytest.raises(AttributeError, match="no_such_thing"):
         env.no_such_thing  # noqa: B018
     env.close()
