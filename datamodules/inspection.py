@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from typing import Any
 
@@ -78,10 +79,23 @@ def describe(
         if task.maze_map is not None:
             facts["episodes that reach the goal"] = int(terminated.sum())
             facts["free cells visited"] = f"{_visited(trajectories, task)} of {len(task.free_cells())}"
+    if repeats := count_repeats(trajectories):
+        facts["repeated episodes"] = repeats
     if horizon is not None:
         facts[f"segments of {horizon} steps"] = len(trajectories.windows(horizon))
     facts["fingerprint"] = trajectories.fingerprint()
     return facts, dimension_table(trajectories, task)
+
+
+def count_repeats(trajectories: Trajectories) -> int:
+    """Count the episodes whose observations and actions are those of an earlier one, to the bit."""
+    seen: set[bytes] = set()
+    for number in range(trajectories.num_episodes):
+        episode = trajectories.episode(number)
+        digest = hashlib.sha256(np.ascontiguousarray(episode["observations"]).data)
+        digest.update(np.ascontiguousarray(episode["actions"]).data)
+        seen.add(digest.digest())
+    return trajectories.num_episodes - len(seen)
 
 
 def dimension_table(trajectories: Trajectories, task: Task | None = None) -> pd.DataFrame:

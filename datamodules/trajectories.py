@@ -115,7 +115,7 @@ class Trajectories:
                 field and the value.
         """
         if not len(episodes):
-            raise DataError(f"data set '{name}' is empty: it has no episodes")
+            raise DataError(f"data set '{name}' is empty: it has no episodes; give at least one")
         first = episodes[0]
         observation_dim = observation_dim or _width(first.get("observations"))
         action_dim = action_dim or _width(first.get("actions")) or 1

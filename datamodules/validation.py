@@ -55,7 +55,7 @@ def validate_episode(
     for name in FIELDS:
         if name not in fields or fields[name] is None:
             found = ", ".join(fields) or "nothing"
-            raise DataError(f"{where}: '{name}' is missing; expected {', '.join(FIELDS)}, got {found}")
+            raise DataError(f"{where}: '{name}' is missing; expected {', '.join(FIELDS)}, got {found}; add it")
     arrays = {name: _array(where, name, fields[name]) for name in FIELDS}
     _check_shapes(where, arrays, observation_dim, len(action_low))
     for name in ("observations", "actions", "rewards"):
@@ -73,11 +73,16 @@ def _array(where: str, name: str, value: Any) -> NDArray[Any]:
     flag = name in ("terminations", "truncations")
     if array.dtype.kind not in ("b" if flag else "fiu") and not (flag and array.dtype.kind in "iu"):
         expected = "true and false" if flag else "real numbers"
-        raise DataError(f"{where}, {name}: got values of type {array.dtype}, expected {expected}")
+        if name == "observations" and (isinstance(value, Mapping) or any(isinstance(x, Mapping) for x in value)):
+            raise DataError(
+                f"{where}, observations: got dictionaries, expected (steps + 1, O) numbers; put their entries end to "
+                "end, as an environment of a task file with observation_keys gives them"
+            )
+        raise DataError(f"{where}, {name}: got values of type {array.dtype}, expected {expected}; convert them")
     if flag and array.dtype.kind != "b":
         odd = array[(array != 0) & (array != 1)]
         if odd.size:
-            raise DataError(f"{where}, {name}: got {odd.flat[0]}, expected 0 or 1")
+            raise DataError(f"{where}, {name}: got {odd.flat[0]}, expected 0 or 1; convert them to true and false")
         return array.astype(bool)
     return array
 
@@ -88,18 +93,23 @@ def _check_shapes(where: str, arrays: dict[str, NDArray[Any]], observations: int
         shape = arrays[name].shape
         if len(shape) != 2 or shape[1] != (shape[1] if width is None else width):
             expected = "(steps, any)" if width is None else f"(steps, {width})"
-            raise DataError(f"{where}, {name}: got shape {shape}, expected {expected}")
+            raise DataError(f"{where}, {name}: got shape {shape}, expected {expected}; stack one row per step")
     for name in ("rewards", "terminations", "truncations"):
         if arrays[name].ndim != 1:
-            raise DataError(f"{where}, {name}: got shape {arrays[name].shape}, expected (steps,)")
+            raise DataError(
+                f"{where}, {name}: got shape {arrays[name].shape}, expected (steps,); give one value per step"
+            )
     if steps == 0:
-        raise DataError(f"{where}, rewards: got 0 steps, expected at least 1")
+        raise DataError(f"{where}, rewards: got 0 steps, expected at least 1; leave the episode out")
     for name in ("actions", "terminations", "truncations"):
         if len(arrays[name]) != steps:
-            raise DataError(f"{where}, {name}: got {len(arrays[name])} rows, but rewards has {steps}")
+            raise DataError(
+                f"{where}, {name}: got {len(arrays[name])} rows, but rewards has {steps}; give one of each per step"
+            )
     seen = len(arrays["observations"])
     if seen != steps + 1:
-        missing = "; the observation after the last step is missing" if seen == steps else ""
+        lacking = "the observation after the last step is missing: append it, or leave out the last step"
+        missing = f"; {lacking if seen == steps else 'cut them to the same steps'}"
         raise DataError(f"{where}, observations: got {seen} rows, expected {steps + 1} (T + 1){missing}")
 
 
@@ -121,7 +131,9 @@ def finite(where: str, array: NDArray[Any], *, first: int = 0, unit: str = "step
     if len(bad):
         index = tuple(int(i) for i in bad[0])
         place = f"{unit} {first + index[0]}" + (f", column {index[1]}" if len(index) > 1 else "")
-        raise DataError(f"{where}: got {array[index]} at {place}, expected finite 32-bit numbers")
+        raise DataError(
+            f"{where}: got {array[index]} at {place}, expected finite 32-bit numbers; leave that {unit} out"
+        )
     return single
 
 
@@ -151,7 +163,8 @@ def in_box(
     if len(outside):
         t, j = (int(i) for i in outside[0])
         raise DataError(
-            f"{where}: got {actions[t, j]:g} at {unit} {first + t}, column {j}, expected {low[j]:g} to {high[j]:g}"
+            f"{where}: got {actions[t, j]:g} at {unit} {first + t}, column {j}, expected {low[j]:g} to {high[j]:g}; "
+            "for another box give action_low and action_high, to from_episodes or in the task file"
         )
     return np.clip(actions, low, high)
 
@@ -226,10 +239,10 @@ def _check_ends(where: str, arrays: dict[str, NDArray[Any]]) -> None:
         if len(early):
             raise DataError(
                 f"{where}, {name}: got True at step {early[0]}, inside an episode of {len(arrays[name])} "
-                "steps; expected it on the last step only"
+                "steps, expected it on the last step only; divide the episode there"
             )
     if not (arrays["terminations"][-1] or arrays["truncations"][-1]):
         raise DataError(
-            f"{where}: never ends: terminations and truncations are both False on the last step; "
-            "expected one of them True"
+            f"{where}: never ends: terminations and truncations are both False on the last step, expected one of them "
+            "True; set truncations there if only the recording ended"
         )

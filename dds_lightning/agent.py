@@ -16,6 +16,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
+from dds_lightning.envs.flatten import numbers
 from dds_lightning.errors import UserError
 from dds_lightning.saving.files import short
 
@@ -105,8 +106,8 @@ class DDSAgent(nn.Module):
             if learnt_with and learnt_with != (found := self.skill.fingerprint()):
                 raise UserError(
                     f"the policy was trained on the codes of skill model {short(learnt_with)}, this one is "
-                    f"{short(found)}: they do not belong together; give the skill checkpoint that the policy "
-                    "was trained with"
+                    f"{short(found)}: they do not belong together; give the skills that the policy was trained with, "
+                    "or train a policy on these with `dds policy fit --data.skill SKILL.ckpt`"
                 )
 
     # ---------------------------------------------------------------- acting
@@ -118,11 +119,10 @@ class DDSAgent(nn.Module):
             selection: As in the constructor; this agent's by default.
             **settings: `temperature`, `noise_scale`, `fixed_codes`, `seed`, as in the constructor.
         """
-        given: dict[str, Any] = {"selection": selection or self.selection, "temperature": self.temperature}
-        given |= {"noise_scale": self._noise_scale, "seed": self._seed}
-        if given["selection"] == "fixed":
-            given["fixed_codes"] = self.fixed_codes
-        return DDSAgent(self.skill, self.policy, **{**given, **settings})
+        selection = selection or self.selection
+        given: dict[str, Any] = {"temperature": self.temperature, "noise_scale": self._noise_scale, "seed": self._seed}
+        given["fixed_codes"] = self.fixed_codes if selection == "fixed" else None
+        return DDSAgent(self.skill, self.policy, selection, **{**given, **settings})
 
     @property
     def noise_scale(self) -> float:
@@ -183,16 +183,15 @@ class DDSAgent(nn.Module):
             (E, A) float32, or (A,) for a single environment; the environment's units, inside its box.
 
         Raises:
-            UserError: Shapes do not fit.
+            UserError: Shapes do not fit, or observations are no finite numbers.
         """
-        batch = np.asarray(observations, dtype=np.float32)
-        single, batch = batch.ndim == 1, np.atleast_2d(batch)
+        batch = numbers(observations)
+        single, x = batch.ndim == 1, self.observe(np.atleast_2d(batch))
         if not self.num_envs:
-            self.reset(len(batch) if rows is None else int(np.max(rows)) + 1)
+            self.reset(len(x) if rows is None else int(np.max(rows)) + 1)
         rows = np.arange(self.num_envs) if rows is None else np.asarray(rows)
-        x = self.observe(batch)
-        if len(batch) != len(rows):
-            raise UserError(f"{len(batch)} observations for {len(rows)} environments: reset({len(batch)}) first")
+        if len(x) != len(rows):
+            raise UserError(f"{len(x)} observations for {len(rows)} environments: reset({len(x)}) first")
         if restarted is not None and np.shape(restarted) != rows.shape:
             raise UserError(f"restarted is {np.shape(restarted)}, expected ({len(rows)},)")
         actions = self.decode(x, self.choose(x, restarted, rows))
@@ -202,11 +201,12 @@ class DDSAgent(nn.Module):
         """Move observations (n, O) to the networks' device.
 
         Raises:
-            UserError: They have another shape.
+            UserError: They have another shape, or are not finite.
         """
+        observations = numbers(observations)
         if observations.ndim != 2 or observations.shape[1] != self.observation_dim:
             raise UserError(
-                f"observations are {observations.shape}, expected ({len(observations)}, {self.observation_dim}): this "
+                f"observations are {observations.shape}, expected (environments, {self.observation_dim}): this "
                 "agent was trained on another environment, or the observations are not flat"
             )
         return torch.from_numpy(np.ascontiguousarray(observations)).to(self.device)
@@ -222,11 +222,8 @@ class DDSAgent(nn.Module):
         if due.any():
             late = rows[due]
             chosen = observations if due.all() else observations[torch.from_numpy(due).to(observations.device)]
-            self._codes[late], self._clock[late], self._decided[late] = (
-                self._pick(chosen, late),
-                self.horizon,
-                True,
-            )
+            self._codes[late] = self._pick(chosen, late)
+            self._clock[late], self._decided[late] = self.horizon, True
         self._clock[rows] -= 1
         return self._codes[rows]
 

@@ -45,7 +45,7 @@ def lacks_extra(what: str, extra: str) -> UserError:
         what: What needs which package, as the sentence begins.
         extra: The extra of this project that brings it.
     """
-    return UserError(f"{what}: run `pip install -e '.[{extra}]'` in the folder of this project's checkout")
+    return UserError(f"{what}: run `pip install -e '.[{extra}]' -c constraints.txt` in this project's checkout")
 
 
 def is_out_of_memory(error: BaseException) -> bool:

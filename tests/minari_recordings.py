@@ -80,7 +80,7 @@ def changed_spec(folder: Path, **entries: Any) -> str:
 def _recorded(task: Task) -> Recorded:
     """Specification and spaces of the environment inside the task's adapter."""
     env = task.make_env()
-    inner = env.unwrapped
+    inner = env.env.unwrapped
     env.close()
     return inner.spec, inner.observation_space, inner.action_space
 

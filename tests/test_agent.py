@@ -102,6 +102,28 @@ def test_rows_that_are_left_out_keep_their_clock():
     assert agent.decided.tolist() == [True, False, True]
 
 
+@pytest.mark.parametrize(
+    ("observations", "message"),
+    [
+        ({"observation": [0.0, 1.0], "desired_goal": [0.0]}, "a dictionary of observation, desired_goal, expected one"),
+        ((np.zeros(2), {}), "are a tuple, expected an array of numbers: reset returns them and a dictionary"),
+        ([[0.0, 1.0], [0.0]], "are a list, expected an array of numbers$"),
+        ("left", "are a str, expected an array of numbers$"),
+        ([0.0, np.nan], r"hold nan at \[1\], expected finite numbers"),
+        ([[0.0, 0.0], [1e39, 0.0]], r"hold inf at \[1, 0\], expected finite numbers"),
+        ([0.0, 1.0, 2.0], r"are \(1, 3\), expected \(environments, 2\)"),
+        (np.zeros((1, 1, 2)), r"are \(1, 1, 2\), expected \(environments, 2\)"),
+        (0.0, r"are \(1, 1\), expected \(environments, 2\)"),
+    ],
+)
+def test_what_cannot_be_acted_on_is_told_in_a_sentence_and_changes_nothing(observations, message):
+    agent = DDSAgent(CodeSkill(), StatePolicy(), "greedy")
+    with pytest.raises(UserError, match=message):
+        agent.act(observations)
+    assert agent.num_envs == 0
+    assert agent.act([3.0, 0.0]).tolist() == [3.0]
+
+
 def test_reset_starts_all_clocks_anew():
     agent = DDSAgent(CodeSkill(), StatePolicy(), "greedy")
     agent.act(observe(1, 1))
@@ -232,7 +254,7 @@ def test_it_acts_in_a_plain_gymnasium_environment():
 @pytest.mark.parametrize(
     ("observations", "settings", "message"),
     [
-        (np.zeros((2, 5)), {}, r"observations are \(2, 5\), expected \(2, 4\)"),
+        (np.zeros((2, 5)), {}, r"observations are \(2, 5\), expected \(environments, 4\)"),
         (np.zeros((3, 4)), {}, "3 observations for 2 environments"),
         (np.zeros((2, 1, 4)), {}, r"observations are \(2, 1, 4\)"),
         (np.zeros((2, 4)), {"restarted": np.ones(3, bool)}, r"restarted is \(3,\)"),

@@ -32,7 +32,7 @@ ROOMS = {
     "dds_lightning.module": "errors finetune nn saving",
     "dds_lightning.skill": "errors module nn",
     "dds_lightning.policy": "errors losses module nn",
-    "dds_lightning.agent": "errors policy saving skill",
+    "dds_lightning.agent": "envs errors policy saving skill",
     "dds_lightning.rollout": "console errors envs saving tasks",
     # the data
     "datamodules.validation": "errors",
@@ -69,8 +69,8 @@ ROOMS = {
     "datamodules.inspection datamodules.trajectories",
     "dds_lightning.interpret.atlas": "interpret.draw interpret.measure interpret.views rollout saving tasks "
     "datamodules.trajectories",
-    "dds_lightning.study": "agent callbacks console errors interpret.atlas interpret.draw interpret.measure rollout "
-    "saving skill tasks datamodules.collect datamodules.relabel datamodules.relabelling datamodules.sources",
+    "dds_lightning.study": "agent callbacks console errors interpret.atlas interpret.draw interpret.measure policy "
+    "rollout saving skill tasks datamodules.collect datamodules.relabel datamodules.relabelling datamodules.sources",
     "dds_lightning.sharing": "agent errors saving tasks training",
     "dds_lightning.pipeline": "agent baselines configs console errors policy rollout saving skill study tasks training "
     "datamodules.collect datamodules.inspection datamodules.relabelled datamodules.relabelling datamodules.relabel "

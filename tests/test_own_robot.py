@@ -1,6 +1,7 @@
 """A robot that the table of tasks does not know: its arrays train an agent, its own `Task` lets it be played."""
 
 import warnings
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -145,5 +146,42 @@ def test_minari_sets_of_it_are_taken_without_an_environment_and_refused_with_a_w
             warnings.simplefilter("ignore")  # that no author was given
             minari.create_dataset_from_buffers(f"trolley/{name}-v0", buffers, env=env, **spaces)
     assert load_trajectories("minari:trolley/without-v0").fingerprint() == made_of(episodes).fingerprint()
-    with pytest.raises(DataError, match=r"'Trolley-v0', which no task uses; .* of your own, write the data without"):
+    monkeypatch.setattr("dds_lightning.tasks._OWN", {})
+    with pytest.raises(DataError, match=r"'Trolley-v0', which no task uses; .* of your own, give its task with --task"):
         load_trajectories("minari:trolley/with-v0")
+    for name in ("with", "without"):
+        assert load_trajectories(f"minari:trolley/{name}-v0", RAIL).fingerprint() == made_of(episodes).fingerprint()
+
+
+@pytest.mark.parametrize("keys", [["observation"], ["observation", "desired_goal"]])
+def test_minari_sets_of_its_environment_are_flattened_as_its_task_file_says(tmp_path, monkeypatch, keys):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    import minari
+    from minari.data_collector import EpisodeBuffer
+
+    address = tmp_path / "reach.yaml"
+    address.write_text(
+        f"env_id: FetchReach-v4\nmax_episode_steps: 20\nscore_min: -20\nscore_max: 0\nobservation_keys: {keys}\n"
+    )
+    task = get_task(str(address))
+    env, plain, flat, buffers = task.make_env(), gym.make("FetchReach-v4"), [], []
+    for number in range(2):
+        seen, taken = [plain.reset(seed=number)[0]], plain.action_space.sample()
+        flat.append(env.reset(seed=number)[0])
+        for _ in range(20):
+            seen.append(plain.step(taken)[0])
+            flat.append(env.step(taken)[0])
+        last = np.arange(20) == 19
+        states = {key: np.stack([one[key] for one in seen]) for key in seen[0]}
+        fields = {"rewards": -np.ones(20), "terminations": last & False, "truncations": last}
+        buffers.append(EpisodeBuffer(id=number, observations=states, actions=np.stack([taken] * 20), **fields))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that no author was given
+        minari.create_dataset_from_buffers("fetch/reach-v0", buffers, env="FetchReach-v4")
+    data = load_trajectories("minari:fetch/reach-v0", task)
+    assert data.lengths.tolist() == [20, 20]
+    np.testing.assert_allclose(data.observations, np.stack(flat), atol=1e-6)
+    with pytest.raises(
+        DataError, match=r"its observation space is a Dict .*needs a Dict with observation, desired_goal"
+    ):
+        load_trajectories("minari:fetch/reach-v0", replace(task, observation_keys=("observation", "desired_goal", "z")))

@@ -63,7 +63,6 @@ def _plan(task: Task, seed: int, steps: int, recipe: AntMazeRecipe) -> DataSetPl
     return DataSetPlan(
         recorder,
         recorder.env(),
-        gym.spaces.Box(-np.inf, np.inf, (task.observation_dim,), np.float32),
         algorithm="shortest path over cells, heading-conditioned Ant controller",
         description=_description(task, seed, recipe),
         settings={"controller": sha256(SHIPPED / "ant" / f"{task.physics}.safetensors")},
@@ -124,7 +123,7 @@ class _Walk:
         self.state = self._placed(_draw(self.rng, task.data_start_cells or task.free_cells()))
         self.noise = recipe.action_noise * self.rng.standard_normal((length, task.action_dim))
         self.offsets = (self.rng.uniform(0.0, 1.0, (length, 2)) * recipe.waypoint_noise).tolist()
-        self.observations = np.empty((length + 1, task.observation_dim), np.float32)
+        self.observations = np.empty((length + 1, task.observation_dim))
         self.actions = np.empty((length, task.action_dim), np.float32)
         self.goals = np.empty((length + 1, 2), np.float32)
         self.t = self.on_back = 0

@@ -25,7 +25,6 @@ class DataSetPlan:
     Attributes:
         recorder: Records the episodes.
         env: The recorded environment, made by its id.
-        observation_space: Of the stored observations.
         algorithm: Minari's `algorithm_name`.
         description: Minari's `description`.
         settings: What the data depend on beside task, seed, steps and recipe.
@@ -38,7 +37,6 @@ class DataSetPlan:
 
     recorder: EpisodeRecorder
     env: gym.Env[Any, Any]
-    observation_space: gym.Space[Any]
     algorithm: str
     description: str
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -124,13 +122,13 @@ class Collector:
             folder.name,
             episodes,
             env_spec=env_spec,
-            observation_space=plan.observation_space,
+            observation_space=plan.env.observation_space,
             action_space=plan.env.action_space,
             overwrite=overwrite,
             metadata={
                 "author": ["dds-lightning"],
                 "algorithm_name": plan.algorithm,
-                "description": plan.description,
+                "description": plan.description + _how_to_build(env_spec),
                 **({"eval_env_spec": plan.evaluation.to_json()} if plan.evaluation else {}),
                 "requirements": [f"{package}=={installed.version(package)}" for package in plan.packages],
                 "collection": collection,
@@ -138,6 +136,16 @@ class Collector:
         )
         partial.remove()
         return folder
+
+
+def _how_to_build(env_spec: EnvSpec) -> str:
+    """What `recover_environment` of a Minari installation needs for an environment of this package."""
+    if not str(env_spec.entry_point).startswith("dds_lightning."):
+        return ""
+    return (
+        f" The environment {env_spec.id} comes with dds-lightning: install it from its checkout, with "
+        "`pip install -e . -c constraints.txt`, before Minari's `recover_environment`."
+    )
 
 
 def prepare_folder(task: Task, steps: int, seed: int, out: str | Path, dataset_id: str | None, overwrite: bool) -> Path:

@@ -83,6 +83,7 @@ def collect(
     """
     task = get_task(task)
     refuse_uncollectable(task)
+    task = known_task(task.name.partition("?")[0])  # data are made for every start and goal alike
     collector, settings = collector_of(task), dict(recipe or {})
     assert collector is not None
     known = [one.name for one in fields(collector.recipe)]

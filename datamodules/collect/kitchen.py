@@ -91,7 +91,6 @@ def _plan(task: Task, seed: int, steps: int, recipe: KitchenRecipe) -> DataSetPl
     return DataSetPlan(
         recorder,
         env,
-        env.observation_space,
         algorithm="scripted moves of the hand, damped least-squares inverse kinematics",
         description=_description(task, seed, recipe),
         settings={"moves": hashlib.sha256(repr(SCRIPTS).encode()).hexdigest()[:16]},

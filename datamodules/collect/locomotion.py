@@ -66,7 +66,6 @@ def _plan(
     return DataSetPlan(
         recorder,
         recorder.env(),
-        gym.spaces.Box(-np.inf, np.inf, (task.observation_dim,), np.float32),
         algorithm=f"PPO, {', '.join(chosen)}",
         description=f"{body} run by {len(chosen)} behaviour(s) {noise}. Seed {seed}.",
         settings={"behaviours": {rung: dict(policy.metadata) for rung, policy in chosen.items()}},
@@ -161,7 +160,7 @@ class _Run:
     def _episode(self, terminated: bool) -> Episode:
         last = np.arange(len(self.rewards)) == len(self.rewards) - 1
         return {
-            "observations": np.array(self.observations, np.float32),
+            "observations": np.array(self.observations),
             "actions": np.array(self.actions),
             "rewards": np.array(self.rewards),
             "terminations": last & terminated,

@@ -28,7 +28,6 @@ def _plan(task: Task, seed: int, steps: int, recipe: PointMazeRecipe) -> DataSet
     return DataSetPlan(
         recorder,
         env,
-        env.observation_space,
         algorithm="shortest path over cells, velocity controller, random bursts",
         description=_description(task, seed, recipe),
         env_spec=collection_spec(task, recipe.episode_steps),

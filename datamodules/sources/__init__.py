@@ -5,7 +5,11 @@ A new source is one `Source` record in a file of its own and one entry of `SOURC
 
 from __future__ import annotations
 
-from typing import Literal
+import contextlib
+import warnings
+from collections.abc import Iterator
+from functools import partial
+from typing import Any, Literal
 
 from datamodules.sources.arrays import ARRAYS
 from datamodules.sources.d4rl import D4RL
@@ -15,7 +19,7 @@ from datamodules.sources.source import Source
 from datamodules.sources.subtasks import relabel_subtasks
 from datamodules.trajectories import DataError, Trajectories
 from dds_lightning.errors import UserError
-from dds_lightning.tasks import Task, get_task, task_for_env
+from dds_lightning.tasks import Task, get_task, is_own, remember, task_for_env
 
 SOURCES: dict[str, Source] = {"local": LOCAL, "minari": MINARI, "arrays": ARRAYS, "d4rl": D4RL}
 """What stands before the colon -> the source."""
@@ -34,6 +38,17 @@ def parse_spec(spec: str) -> tuple[Source, str]:
     return SOURCES[name], rest
 
 
+@contextlib.contextmanager
+def _remedy(source: Source) -> Iterator[None]:
+    """Add to a refusal of data what helps, unless it has said so after a semicolon."""
+    try:
+        yield
+    except DataError as error:
+        if "; " in str(error):
+            raise
+        raise DataError(f"{error}; {source.again}") from error
+
+
 def resolve_task(spec: str, task: Task | str) -> Task:
     """The variant of a task in which the data were recorded.
 
@@ -45,8 +60,11 @@ def resolve_task(spec: str, task: Task | str) -> Task:
         DataError: For data of another task.
     """
     task = get_task(task)
+    if is_own(task):
+        remember(task)  # the reader accepts recordings of its environment
     source, rest = parse_spec(spec)
-    env_id = source.recorded_in(rest)
+    with _remedy(source):
+        env_id = source.recorded_in(rest)
     if env_id is None:
         return task
     found = task_for_env(task, env_id)
@@ -87,8 +105,16 @@ def load_trajectories(
         raise UserError(f"reward: got '{reward}', expected 'task' or 'recorded'")
     source, rest = parse_spec(spec)
     task = resolve_task(spec, task) if task is not None else None
-    trajectories = source.load(rest, task)
+    with _remedy(source):
+        trajectories = source.load(rest, task)
     if task is not None and reward == "task" and task.data_reward != "environment":
-        relabel = {"goal": relabel_to_goal, "arrival": cut_at_arrivals, "subtasks": relabel_subtasks}[task.data_reward]
+        to_goal = partial(relabel_to_goal, drawn=task.goal_noise > 0)
+        relabel: Any = {"goal": to_goal, "arrival": cut_at_arrivals, "subtasks": relabel_subtasks}[task.data_reward]
         trajectories = relabel(trajectories, task)
+        if "?" in task.name and not trajectories.terminations.any():
+            warnings.warn(
+                f"data '{spec}': no episode reaches the goal of {task.name}, so nothing rewards it; collect data "
+                "that do, or choose another goal",
+                stacklevel=2,
+            )
     return trajectories.for_task(task)

@@ -65,4 +65,5 @@ ARRAYS = Source(
     load=load_arrays,
     locate=lambda directory: Path(directory).expanduser(),
     open_rows=open_arrays,
+    again="write the folder again with `Trajectories.save`",
 )

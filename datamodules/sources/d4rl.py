@@ -94,7 +94,7 @@ def load_d4rl(name: str, task: Task | None) -> Trajectories:
     if not (rows.last[:-1].any() or rows.terminals.any() or rows.timeouts.any()):
         raise DataError(
             f"{where}, terminals: none of the {len(rows.last)} rows is marked as an episode's last, there or in "
-            "timeouts; it has no complete episode"
+            "timeouts, so it has no complete episode"
         )
     return _episodes(rows, path.stem, where, low, high)
 
@@ -273,7 +273,7 @@ def _following(dataset: h5py.Dataset, where: str, observations: Floats, last: Fl
     if strays > len(observations) / 10:
         raise DataError(
             f"{where}: {strays} of {len(observations)} rows differ from the next row's observations, though no episode "
-            "ends there; the file mixes up its rows"
+            "ends there: the file mixes up its rows"
         )
     return np.concatenate(parts)
 
@@ -346,4 +346,4 @@ class _D4RLRows:
         return tuple(read_rows(field, f"{self.where}, infos", row, row + 1)[0] for field in self.inner_state) or None
 
 
-D4RL = Source("FILE", "an HDF5 file in D4RL's layout", load_d4rl, find_d4rl, open_d4rl)
+D4RL = Source("FILE", "an HDF5 file in D4RL's layout", load_d4rl, find_d4rl, open_d4rl, "get or write the file anew")

@@ -10,7 +10,7 @@ from datamodules.windows import ranges
 from dds_lightning.tasks import Task
 
 
-def relabel_to_goal(trajectories: Trajectories, task: Task) -> Trajectories:
+def relabel_to_goal(trajectories: Trajectories, task: Task, drawn: bool = False) -> Trajectories:
     """Give every step the reward of the task's goal, and end episodes where it is reached.
 
     `r_t = 1` if the position after step t lies within `goal_radius` of the goal, else 0. Reaching the goal
@@ -20,12 +20,18 @@ def relabel_to_goal(trajectories: Trajectories, task: Task) -> Trajectories:
     Args:
         trajectories: Positions are the first two columns of the observations.
         task: A maze task.
+        drawn: Whether every episode has its own goal, as where `task.goal_noise` moves it in evaluations; always the
+            same ones.
 
     Raises:
         DataError: When every recorded state lies on the goal, so that nothing is left.
     """
-    inside = np.linalg.norm(trajectories.observations[:, :2] - task.goal_xy(), axis=1) <= task.goal_radius
-    return _cut(trajectories, inside)
+    goals = np.tile(task.goal_xy(), (trajectories.num_episodes, 1))
+    if drawn:
+        longer, shorter = np.random.default_rng(0).uniform(0.0, task.goal_noise, (2, *goals.shape))
+        goals += (4 * longer + 2 * shorter) / 3 - task.goal_noise  # U(0, 4/3 noise) + U(0, 2/3 noise) from the centre
+    away = trajectories.observations[:, :2] - np.repeat(goals, trajectories.lengths + 1, axis=0)
+    return _cut(trajectories, np.linalg.norm(away, axis=1) <= task.goal_radius)
 
 
 def cut_at_arrivals(trajectories: Trajectories, task: Task) -> Trajectories:

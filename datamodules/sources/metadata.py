@@ -24,12 +24,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.sources.observations import Layout, box_shape, describe_space, find_layout, task_layout
+from datamodules.sources.source import FIT
 from datamodules.validation import DataError
 from dds_lightning.envs.kitchen import SUBTASKS
 from dds_lightning.errors import UserError
 from dds_lightning.saving.files import neighbours
 from dds_lightning.saving.untrusted import parse_json, read_text
-from dds_lightning.tasks import Task, known_env_ids
+from dds_lightning.tasks import Task, is_own, known_env_ids
 
 MAX_BYTES = 2**20
 """Greatest size of a metadata.json; genuine ones have a few thousand bytes."""
@@ -144,7 +145,7 @@ def _registered(name: str, env_id: Any) -> Any:
     if not isinstance(env_id, str) or env_id not in known_env_ids():
         raise DataError(
             f"data set '{name}': it was recorded in {_short(env_id)}, which no task uses; see `dds tasks`, or, for a "
-            "robot of your own, write the data without an environment (no env_spec in metadata.json) or give arrays:DIR"
+            "robot of your own, give its task with --task, a file that names this environment"
         )
     import gymnasium as gym  # slow, and not needed for data sets that are refused earlier
 
@@ -191,10 +192,12 @@ def check_task(metadata: dict[str, Any], task: Task) -> None:
         DataError: When the recording is not of the task.
     """
     name, env = metadata["dataset_id"], metadata["env_spec"]
+    if env is None and is_own(task):
+        return
     if env is None:
         raise DataError(
             f"data set '{name}': metadata.json has no env_spec, so nothing says that it was recorded in "
-            f"{task.env_id}, which task '{task.name}' needs"
+            f"{task.env_id}, which task '{task.name}' needs; write its env_spec, or give the arrays as arrays:DIR"
         )
     maze_map = env["kwargs"].get("maze_map")
     if task.maze_map is not None and maze_map is not None:
@@ -202,7 +205,7 @@ def check_task(metadata: dict[str, Any], task: Task) -> None:
         if walls != task.maze_map:
             raise DataError(
                 f"data set '{name}' was recorded in {env['id']} with other walls ({one_line('/'.join(walls))}) than "
-                f"task '{task.name}' has ({'/'.join(task.maze_map)})"
+                f"task '{task.name}' has ({'/'.join(task.maze_map)}); {FIT}"
             )
     recorded = env["kwargs"].get("tasks_to_complete")
     if task.subtasks and recorded is not None and set(recorded) != set(task.subtasks):
@@ -233,7 +236,7 @@ def observation_layout(metadata: dict[str, Any], task: Task | None) -> Layout:
     subtasks = (env or {"kwargs": {}})["kwargs"].get("tasks_to_complete", list(SUBTASKS))
     layout = task_layout(task) if task else find_layout(space, subtasks)
     if layout is None or not layout.fits(space):
-        needed = f"task '{task.name}' needs {layout}" if task else "no task has such a space"
+        needed = f"task '{task.name}' needs {layout}; {FIT}" if task else "no task has such a space; give a --task file"
         found = one_line(describe_space(space))
         raise DataError(f"data set '{metadata['dataset_id']}': its observation space is {found}, but {needed}")
     return layout
@@ -267,7 +270,7 @@ def action_box(metadata: dict[str, Any], task: Task | None) -> tuple[NDArray[np.
     if low.shape != needed[0].shape or not np.allclose([low, high], needed):
         raise DataError(
             f"{where} is a Box ({len(low)},) from {low.min():g} to {high.max():g}, but task '{task.name}' needs a Box "
-            f"({task.action_dim},) from {task.action_low:g} to {task.action_high:g}"
+            f"({task.action_dim},) from {task.action_low:g} to {task.action_high:g}; {FIT}"
         )
     return needed
 

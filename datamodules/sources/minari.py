@@ -212,8 +212,8 @@ class _Reader:
             raise DataError(f"{where}: got the entries {one_line(', '.join(found)) or 'none'}, expected '{key}'")
         node, where = member(group, key, where), f"{where}/{key}"
         array = check_array(node, where)
-        if len(array.shape) != 2 or array.shape[1] not in part.widths:
-            expected = " or ".join(f"(steps, {width})" for width in part.widths)
+        if len(array.shape) != 2 or array.shape[1] not in (part.widths or array.shape[1:]):
+            expected = " or ".join(f"(steps, {width})" for width in part.widths) or "(steps, width)"
             raise DataError(f"{where}: got shape {array.shape}, expected {expected}")
         self._count(array.nbytes)
         return read_rows(array, where, 0, len(array), part.columns)
@@ -318,6 +318,7 @@ LOCAL = Source(
     load=load_local,
     locate=lambda directory: Path(directory).expanduser(),
     open_rows=open_local,
+    again="collect or download the data set again",
     recorded_in=local_env_id,
 )
 
@@ -327,6 +328,7 @@ MINARI = Source(
     load=lambda dataset_id, task: load_local(minari_folder(dataset_id), task),
     locate=lambda dataset_id: minari_root() / check_minari_id(dataset_id),
     open_rows=lambda dataset_id, task, rng: open_local(minari_folder(dataset_id), task, rng),
+    again=LOCAL.again,
     recorded_in=lambda dataset_id: local_env_id(minari_folder(dataset_id)),
 )
 """`local` under a folder that the id names."""

@@ -6,8 +6,9 @@
 | pointmaze | Dict: `observation` (4,) | `observation` |
 | antmaze | Dict: `achieved_goal` (2,), `observation` (27,), in v5 (105,) with contact forces | both, 27 of the second |
 | kitchen | Dict: `observation` (59,) | positions of robot and objects (30), goal of the subtasks (30) |
+| a task's `observation_keys` | Dict: any arrays | those that the task names, end to end |
 
-The goals of a recording are left out: a task has only one.
+The goals of a recording are left out, unless the task names them: a task of the table has only one.
 """
 
 from __future__ import annotations
@@ -33,16 +34,20 @@ class Layout(NamedTuple):
         name: `FLAT`, or a robot of `tasks.bodies`.
         width: O of flat observations; None accepts any.
         subtasks: In the kitchen, the subtasks of the goal.
+        keys: The task's `observation_keys`.
     """
 
     name: str
     width: int | None = None
     subtasks: Sequence[str] = ()
+    keys: tuple[str, ...] = ()
 
     @property
     def parts(self) -> Mapping[str, Part]:
         """The arrays that are read from a dictionary; none where the observation is one array."""
-        return {} if self.name == FLAT else BODIES[self.name].parts
+        if self.name == FLAT:
+            return dict.fromkeys(self.keys, Part((), None))
+        return BODIES[self.name].parts
 
     def fits(self, space: Mapping[str, Any]) -> bool:
         """Whether the observations of a space (Minari's JSON) have this layout."""
@@ -50,12 +55,17 @@ class Layout(NamedTuple):
             shape = box_shape(space) or ()
             return len(shape) == 1 and self.width in (None, *shape)
         shapes = {name: box_shape(inner) for name, inner in _subspaces(space).items()}
+        if self.keys:
+            found = [shapes.get(key) or () for key in self.keys]
+            return all(len(shape) == 1 for shape in found) and sum(map(sum, found)) == self.width
         return all(shapes.get(name) in [(width,) for width in part.widths] for name, part in self.parts.items())
 
     def __str__(self) -> str:
         """The space, for messages."""
         if not self.parts:
             return f"a Box ({'any' if self.width is None else self.width},)"
+        if self.keys:
+            return f"a Dict with {', '.join(self.keys)} of {self.width} columns in all"
         shapes = (f"{name} {' or '.join(f'({width},)' for width in part.widths)}" for name, part in self.parts.items())
         return f"a Dict of {', '.join(shapes)}"
 
@@ -77,7 +87,8 @@ class Layout(NamedTuple):
 
 def task_layout(task: Task) -> Layout:
     """The layout of recordings of a task's environments."""
-    return Layout(FLAT if task.adapter == "flat" else body_name(task), task.observation_dim, task.subtasks)
+    name = FLAT if task.adapter == "flat" else body_name(task)
+    return Layout(name, task.observation_dim, task.subtasks, task.observation_keys)
 
 
 def find_layout(space: Mapping[str, Any], subtasks: Sequence[str]) -> Layout | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from datamodules.sources.source import FIT
 from datamodules.validation import DataError
 from dds_lightning.envs.kitchen import goal_vector
 from dds_lightning.tasks import Task
@@ -39,7 +40,7 @@ def refuse_other_task(where: str, observations: NDArray[np.float32], task: Task)
     if not low <= height <= high:
         raise DataError(
             f"{where}, observations: the body's median height is {height:.3g} m, but in task '{task.name}' it is "
-            f"between {low:g} and {high:g}; the data are of another body"
+            f"between {low:g} and {high:g}: the data are of another body; {FIT}"
         )
 
 
@@ -51,8 +52,8 @@ def _refuse_other_maze(where: str, rows: NDArray[np.float32], task: Task) -> Non
     share = float((outside | walls[i, j]).mean())
     if share > IN_WALLS:
         raise DataError(
-            f"{where}, observations: {share:.0%} of the positions lie outside the corridors of task '{task.name}'; "
-            "the data are of another maze, or of other physics with other coordinates"
+            f"{where}, observations: {share:.0%} of the positions lie outside the corridors of task '{task.name}': "
+            f"the data are of another maze, or of other physics with other coordinates; {FIT}"
         )
 
 
@@ -63,5 +64,6 @@ def _refuse_other_subtasks(where: str, rows: NDArray[np.float32], task: Task) ->
         row, column = (int(index) for index in odd[0])
         raise DataError(
             f"{where}, observations: got {rows[row, 30 + column]:g} in column {30 + column}, but the goal of task "
-            f"'{task.name}' ({', '.join(task.subtasks)}) has {expected[column]:g} there; the data are of another task"
+            f"'{task.name}' ({', '.join(task.subtasks)}) has {expected[column]:g} there: they are "
+            f"of another task; {FIT}"
         )

@@ -15,6 +15,9 @@ from datamodules.trajectories import Trajectories
 from datamodules.validation import DataError
 from dds_lightning.tasks import Task
 
+FIT = "choose a task that fits the data (`dds tasks`), or other data"
+"""What helps where data are of another task."""
+
 
 class Recording(Protocol):
     """Episodes whose rows can be read one by one.
@@ -59,7 +62,7 @@ def check_width(where: str, task: Task | None, observations: int, actions: int) 
         ("actions", actions, task.action_dim),
     ):
         if found != expected:
-            raise DataError(f"{where}, {name}: got {found} columns, task '{task.name}' needs {expected}")
+            raise DataError(f"{where}, {name}: got {found} columns, task '{task.name}' needs {expected}; {FIT}")
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,7 @@ class Source:
         locate: The file or folder of the data set. It need not exist.
         open_rows: Opens the data set of a task for reading single rows. The generator draws the episodes where the
             source offers only some of them.
+        again: What helps where the data are damaged or incomplete and the message does not say more.
         recorded_in: The id of the environment that the data say they were recorded in, without reading their arrays;
             None where the format does not say.
     """
@@ -82,4 +86,5 @@ class Source:
     load: Callable[[str, Task | None], Trajectories]
     locate: Callable[[str], Path]
     open_rows: Callable[[str, Task, np.random.Generator], AbstractContextManager[Recording]]
+    again: str = "mend the data, or take others"
     recorded_in: Callable[[str], str | None] = lambda rest: None

@@ -68,7 +68,7 @@ class RolloutEvaluation(Callback):
         episodes: int = 20,
         every_n_steps: int | None = None,
         every_n_validations: int = 1,
-        selections: Sequence[AgentSelection] = ("sample",),
+        selections: Sequence[AgentSelection] | AgentSelection = ("sample",),
         temperature: float = 1.0,
         noise_scale: float | None = None,
         skill: str | None = None,
@@ -92,7 +92,8 @@ class RolloutEvaluation(Callback):
         self.task: Task | None = get_task(task) if task else None
         self.episodes, self.episodes_per_skill = episodes, episodes_per_skill
         self.every_n_steps, self.every_n_validations = every_n_steps, every_n_validations
-        self.selections, self.temperature, self.noise_scale = tuple(selections), temperature, noise_scale
+        self.selections = (selections,) if isinstance(selections, str) else tuple(selections)
+        self.temperature, self.noise_scale = temperature, noise_scale
         self.skill_path, self.seed, self.slots, self.workers = skill, seed, slots, workers
         self.history: list[dict[str, float]] = []
         self.last: RolloutResult | None = None

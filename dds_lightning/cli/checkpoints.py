@@ -28,7 +28,7 @@ def publish(
         place: A new directory, or hf:OWNER/NAME.
         skill: Skill checkpoint (.ckpt) instead of a run.
         policy: Policy checkpoint (.ckpt) to go with it.
-        task: Name of the task to keep with it; without it the run's.
+        task: Name of the task to keep with it; without it the one that the run or the checkpoints were trained for.
         card: A text file for README.md; without it the run's card.
         public: Make a new repository on the Hub public.
     """
@@ -39,6 +39,7 @@ def publish(
     from dds_lightning.sharing.verify import verify_published
     from dds_lightning.study.card import with_diagnosis
     from dds_lightning.study.contestants import agent_directory
+    from dds_lightning.study.loose import loose_agent, loose_task
     from dds_lightning.tasks import facts_to_keep, get_task, restore_task
 
     if (run == "-") != (skill is not None):
@@ -48,11 +49,7 @@ def publish(
     chosen = None if task is None else get_task(task)
     text = None if card is None else _text(card)
     if skill is not None:
-        from dds_lightning.policy import PolicyModule
-        from dds_lightning.skill import SkillModule
-
-        chooser = None if policy is None else PolicyModule.load(policy)
-        agent = DDSAgent(SkillModule.load(skill), chooser, "random" if chooser is None else "sample")
+        agent, chosen = loose_agent(skill, policy), loose_task(task, policy, skill)
         about, metrics = {"task": None} if chosen is None else facts_to_keep(chosen), None
     else:
         source = agent_directory(Path(run))
@@ -75,14 +72,21 @@ def publish(
     return Report(facts, [pairs(facts.items()), f'load it with DDSAgent.load("{place}")'])
 
 
-def list_(root: list[str] = ["checkpoints", "runs"]) -> Report:  # noqa: B006 - jsonargparse shows the default
+def list_(
+    directory: list[str] = [],  # noqa: B006 - jsonargparse shows the default
+    root: list[str] = ["checkpoints", "runs"],  # noqa: B006
+) -> Report:
     """List published agents under some folders, with what is wrong with them, if anything.
 
     Args:
-        root: Folders to look in.
+        directory: Folders to look in.
+        root: The folders where none are given.
     """
     from dds_lightning.sharing.verify import find_published
 
+    root = directory or root
+    if missing := [folder for folder in directory if not Path(folder).is_dir()]:
+        raise UserError(f"there is no folder {missing[0]}: give folders with published agents")
     found = find_published(root)
     if found.empty:
         return Report(found, [f"no published agents in {', '.join(root)}; `dds run` and `dds publish` make some"])

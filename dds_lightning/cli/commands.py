@@ -50,7 +50,8 @@ def run(
     measured is null.
 
     Args:
-        task: Name of a task (`dds tasks` lists them), a task file of your own (.yaml), or package.module:NAME.
+        task: Name of a task (`dds tasks` lists them), a task file of your own (.yaml), or package.module:NAME; in mazes
+            `NAME?goal=ROW,COLUMN`, `?start=ROW,COLUMN` or both, joined by &.
         out: Folder of the run; without it runs/TASK.
         data: Your data, local:DIR, minari:ID, d4rl:FILE or arrays:DIR; without it data are collected in the
             environment.
@@ -80,7 +81,7 @@ def run(
     return run_all(
         RunSettings.with_preset(
             task=task,
-            out=Path(out or f"runs/{get_task(task).name}"),
+            out=Path(out or f"runs/{get_task(task).file_name}"),
             data=data_spec(data) if data else None,
             seed=seed,
             preset=preset,
@@ -135,7 +136,9 @@ def relabel(
 
 
 def evaluate(
-    directory: str,
+    directory: str | None = None,
+    skill: str | None = None,
+    policy: str | None = None,
     task: str | None = None,
     episodes: int | None = None,
     selection: list[str] = ["greedy", "sample"],  # noqa: B006
@@ -159,7 +162,9 @@ def evaluate(
     What is not measured is null.
 
     Args:
-        directory: A run of `dds run`, or a published checkpoint.
+        directory: A run of `dds run`, or a published checkpoint; left out with --skill.
+        skill: Skill checkpoint (.ckpt) of `dds skill fit` instead of a run.
+        policy: Policy checkpoint (.ckpt) of `dds policy fit` to go with it.
         task: Name of the task; without it the one the agent was made for.
         episodes: Episodes for each way of choosing skills; without it the task's default.
         selection: How skills are chosen: greedy, sample, argmax_q, random; several give one row each.
@@ -173,7 +178,9 @@ def evaluate(
     from dds_lightning.study.evaluate import evaluate as play
 
     return play(
-        Path(directory),
+        None if directory in (None, "-") else Path(str(directory)),
+        skill=skill,
+        policy=policy,
         task=task,
         episodes=episodes,
         selection=selection,
@@ -222,7 +229,7 @@ def data_check(data: str, task: str | None = None, horizon: int | None = None, r
         facts = check_dataset(spec, task, horizon=horizon)
         return Report(
             {"data": spec, "task": task, "sound": True, "facts": facts, "replay": None},
-            [_facts(facts), f"{spec} is sound" + (f" and fits {task}" if task else "")],
+            [_facts(facts), *_repeats(facts), f"{spec} is sound" + (f" and fits {task}" if task else "")],
         )
     if task is None:
         raise UserError("--replay needs an environment: give --task NAME; `dds tasks` lists them")
@@ -233,7 +240,12 @@ def data_check(data: str, task: str | None = None, horizon: int | None = None, r
     facts = check_dataset(spec, found.task if found.fit else None, horizon=horizon)
     return Report(
         {"data": spec, "task": found.task.name, "sound": True, "facts": facts, "replay": found.facts()},
-        [_facts(facts), table(found.table().head(12), f"{found.steps} steps in {found.task.name}"), *found.lines()],
+        [
+            _facts(facts),
+            *_repeats(facts),
+            table(found.table().head(12), f"{found.steps} steps in {found.task.name}"),
+            *found.lines(),
+        ],
         status=0 if found.fit else 1,
     )
 
@@ -242,7 +254,8 @@ def tasks(name: str | None = None) -> Report:
     """List the tasks, or show everything about one: environment, episodes, maze, rewards, scores, data.
 
     Args:
-        name: Name of one task or of one of its variants, for example antmaze-umaze@robotics.
+        name: Name of one task or of one of its variants, for example antmaze-umaze@robotics, or a maze with another
+            goal, for example 'antmaze-umaze?goal=1,3'.
     """
     from dds_lightning.tasks import get_task, task_names, task_table
     from dds_lightning.tasks.facts import draw_maze, task_facts, task_lines
@@ -263,6 +276,15 @@ def tasks(name: str | None = None) -> Report:
             "`dds tasks NAME` shows everything about one task, including its maze and its data.",
         ],
     )
+
+
+def _repeats(facts: dict[str, object]) -> list[str]:
+    """A line about identical episodes, if there are any."""
+    count = facts.get("repeated episodes")
+    told = (
+        f"{count} of the {facts['episodes']} episodes repeat an earlier one to the bit: training and validation would "
+    )
+    return [told + "share them, and held-out losses mean little; leave the repeats out"] if count else []
 
 
 def _facts(facts: dict[str, object]) -> str:

@@ -20,15 +20,22 @@ if TYPE_CHECKING:
 FIGURES = (".png", ".pdf", ".svg")
 
 
-def list_(root: list[str] = ["data"]) -> Report:  # noqa: B006 - jsonargparse shows the default
+def list_(
+    directory: list[str] = [],  # noqa: B006 - jsonargparse shows the default
+    root: list[str] = ["data"],  # noqa: B006
+) -> Report:
     """List data sets and the tasks that they fit: in Minari's folder, in D4RL's and in your own folders.
 
     Args:
-        root: Folders to search besides MINARI_DATASETS_PATH (or ~/.minari/datasets) and D4RL_DATASET_DIR (or
+        directory: Folders to search besides MINARI_DATASETS_PATH (or ~/.minari/datasets) and D4RL_DATASET_DIR (or
             ~/.d4rl/datasets).
+        root: The folders to search where none are given.
     """
     from datamodules.listing import find_datasets
 
+    root = directory or root
+    if missing := [folder for folder in directory if not Path(folder).is_dir()]:
+        raise UserError(f"there is no folder {missing[0]}: give folders with data sets")
     found = find_datasets(root)
     if found.empty:
         where = ", ".join(["Minari's folder", "D4RL's folder", *root])

@@ -7,7 +7,8 @@ from typing import Any
 import docstring_parser
 from jsonargparse import ArgumentParser
 
-from dds_lightning.cli import atlas, checkpoints, commands, data
+from dds_lightning.cli import atlas, checkpoints, commands, data, record
+from dds_lightning.console.arguments import as_lists, list_options
 from dds_lightning.errors import UserError
 from dds_lightning.training.stages import STAGES
 
@@ -17,8 +18,13 @@ GROUPS = {
     "data": "List, show, check, fetch and collect data sets.",
     "checkpoints": "List and verify published agents.",
 }
-OPTIONAL_POSITIONALS = {commands.tasks: "name"}
-"""Functions with a parameter that has a default but is still a positional argument."""
+OPTIONAL_POSITIONALS: dict[Callable[..., Any], tuple[str, str]] = {
+    commands.tasks: ("name", "?"),
+    commands.evaluate: ("directory", "?"),
+    checkpoints.list_: ("directory", "*"),
+    data.list_: ("directory", "*"),
+}
+"""Functions with a parameter that has a default but is still a positional argument, and how often it may be given."""
 TAKES_STAGES = (commands.run,)
 """Functions that take the arguments of each training stage as a keyword of its name."""
 
@@ -32,6 +38,7 @@ def command_table() -> Commands:
         "evaluate": commands.evaluate,
         "report": commands.report,
         "atlas": atlas.atlas,
+        "record": record.record,
         "data": {
             "list": data.list_,
             "show": data.show,
@@ -76,9 +83,9 @@ def _add(parser: ArgumentParser, table: Commands, functions: dict[str, Callable[
             leaf.add_argument("--json", action="store_true", help="print one JSON document and nothing else")
             optional = OPTIONAL_POSITIONALS.get(entry)
             if optional:
-                leaf.add_argument(optional, nargs="?", help=_help(documentation, optional))
+                leaf.add_argument(optional[0], nargs=optional[1], help=_help(documentation, optional[0]))
             leaf.add_function_arguments(
-                entry, as_group=False, as_positional=True, skip={optional} if optional else None
+                entry, as_group=False, as_positional=True, skip={optional[0]} if optional else None
             )
             for stage in STAGES if entry in TAKES_STAGES else ():
                 leaf.add_argument(f"--{stage}", type=list[str], default=[], help=f"Settings for `dds {stage} fit`")
@@ -100,7 +107,7 @@ def _help(documentation: str, parameter: str) -> str:
 
 
 def prepare(arguments: list[str]) -> list[str]:
-    """Expand the two shorthands that jsonargparse does not know.
+    """Expand the shorthands that jsonargparse does not know; one value of a list is a list of one.
 
     A bare `--fresh` means `--fresh=true`, and for `dds run` an option like `--skill.trainer.max_steps=100`
     (or the same as two arguments) is collected for the `fit` command of that stage.
@@ -114,6 +121,11 @@ def prepare(arguments: list[str]) -> list[str]:
         for name, parameter in inspect.signature(function).parameters.items()
         if parameter.default is False
     }
+    entry: Any = command_table()
+    for argument in arguments:
+        entry = entry.get(argument) if isinstance(entry, Mapping) else entry
+    if callable(entry):
+        arguments = as_lists(arguments, list_options(entry))
     out: list[str] = []
     rest = iter(arguments)
     for argument in rest:

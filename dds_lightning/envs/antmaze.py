@@ -60,6 +60,7 @@ class D4RLAntMazeEnv(MujocoEnv, EzPickle):
         goal_cell: (row, column) around which goals are drawn.
         cell_size: Side of a cell in metres.
         goal_radius: Distance in metres that counts as reaching the goal.
+        reset_cell: (row, column) where episodes start; None takes `start_cell`.
         render_mode: Gymnasium's render mode; if None, textures are left out and the model builds in a few milliseconds.
         **kwargs: Passed to `MujocoEnv`: `width`, `height`, `camera_id`, `camera_name` and the like.
     """
@@ -76,10 +77,13 @@ class D4RLAntMazeEnv(MujocoEnv, EzPickle):
         goal_cell: tuple[int, int],
         cell_size: float = 4.0,
         goal_radius: float = 0.5,
+        reset_cell: tuple[int, int] | None = None,
         render_mode: str | None = None,
         **kwargs: Any,
     ) -> None:
-        EzPickle.__init__(self, maze_map, start_cell, goal_cell, cell_size, goal_radius, render_mode, **kwargs)
+        arguments = (maze_map, start_cell, goal_cell, cell_size, goal_radius, reset_cell, render_mode)
+        EzPickle.__init__(self, *arguments, **kwargs)
+        self.reset_cell = reset_cell
         self.maze_map, self.start_cell, self.goal_cell = tuple(maze_map), tuple(start_cell), tuple(goal_cell)
         self.cell_size, self.goal_radius = float(cell_size), float(goal_radius)
         self.goal: State = self._centre(self.goal_cell)
@@ -165,6 +169,8 @@ class D4RLAntMazeEnv(MujocoEnv, EzPickle):
             UserError: An option is unknown, or the cell is not free.
         """
         options = {name: value for name, value in (options or {}).items() if value is not None}
+        if self.reset_cell is not None:
+            options.setdefault("reset_cell", self.reset_cell)
         if unknown := set(options) - {"reset_cell", "goal", "noise"}:
             raise UserError(f"reset has no option '{min(unknown)}', expected reset_cell, goal or noise")
         super().reset(seed=seed)

@@ -3,15 +3,17 @@
 The trainings are the very commands `dds skill fit`, `dds policy fit` and `dds clone fit`, which are printed.
 """
 
+import re
 from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
 from dds_lightning.console.reports import Report
+from dds_lightning.errors import UserError
 from dds_lightning.pipeline.context import Run
 from dds_lightning.pipeline.settings import RunSettings
 from dds_lightning.pipeline.steps import STEPS
-from dds_lightning.saving.run_directory import MARKER, RunDirectory, duration, locked
+from dds_lightning.saving.run_directory import MARKER, RunDirectory, duration, locked, read_marker
 from dds_lightning.saving.untrusted import parsing
 from dds_lightning.study.run_task import keep_task
 
@@ -24,6 +26,7 @@ def run_all(settings: RunSettings) -> Report:
     """
     run = Run(settings)
     with locked(run.out):
+        _refuse_other_run(run)
         if run.task != run.asked:
             chosen = f"evaluating in {run.task.name} ({run.task.env_id})"
             run.say(f"the data were recorded in another physics than {run.asked.name}'s: {chosen}")
@@ -41,6 +44,24 @@ def run_all(settings: RunSettings) -> Report:
             if step.name == settings.until:
                 break
     return _report(run)
+
+
+def _refuse_other_run(run: Run) -> None:
+    """Refuse to put another task's run away, whatever its physics: the folder was mistyped.
+
+    Raises:
+        UserError: The folder holds the run of another task.
+    """
+    held = read_marker(run.out / "data").get("settings", {}).get("task")
+    if held is not None and _without_physics(held) != _without_physics(run.task.name):
+        raise UserError(
+            f"--out is {run.out}, which holds a run of {held}, not of {run.asked.name}: give another folder, or move "
+            "that one away"
+        )
+
+
+def _without_physics(name: str) -> str:
+    return re.sub("@[^?]*", "", name)
 
 
 def _report(run: Run) -> Report:

@@ -83,7 +83,7 @@ def _data(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
             wanted.seed,
             folder,
             wanted.workers,
-            dataset_id=run.task.name,
+            dataset_id=run.task.file_name,
             overwrite=True,
         )
         spec = f"local:{outputs['data']}"

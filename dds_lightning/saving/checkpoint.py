@@ -36,6 +36,9 @@ STAGE_KEY = "stage"
 """Entry of a `.ckpt` that holds the name of the training stage; older files are known by a setting of theirs."""
 _TELLTALES = {"tau": "policy", "horizon": "skill", "action_dim": "clone"}
 
+SETTINGS_KEY = "settings"
+"""Entry of a `.ckpt` that holds the settings of data and seed: dotted name -> plain value."""
+
 _ENTRIES: dict[str, type] = {
     **dict.fromkeys(("hyper_parameters", "callbacks", "loops", "settings"), dict),
     **dict.fromkeys(("optimizer_states", "lr_schedulers", "rng"), list),
@@ -182,6 +185,15 @@ def stage_of(checkpoint: Mapping[str, Any]) -> str | None:
     settings = checkpoint.get("hyper_parameters") or {}
     older = next((stage for setting, stage in _TELLTALES.items() if setting in settings), None)
     return checkpoint.get(STAGE_KEY) or older
+
+
+def trained_for(checkpoint: Mapping[str, Any]) -> str | None:
+    """The name of the task that a checkpoint was trained for; None where nothing says it."""
+    for entry, name in ((SETTINGS_KEY, "data.task"), ("datamodule_hyper_parameters", "task")):
+        settings = checkpoint.get(entry)
+        if isinstance(settings, Mapping) and isinstance(settings.get(name), str):
+            return str(settings[name])
+    return None
 
 
 def _write(checkpoint: dict[str, Any], path: Path) -> None:

@@ -22,6 +22,7 @@ from dds_lightning.training.stages import STAGES
 
 SECONDS = 4
 """Work that reading and checking may take each. Both take half a second for the largest of the shipped agents."""
+_TASK = re.compile(r"[\w-]+(@\w+)?(\?(start|goal)=\d+,\d+(&goal=\d+,\d+)?)?")
 TOLERANCE = 1e-3
 """Largest difference between stored and computed answers: processors and library versions round differently, but other
 weights differ by more."""
@@ -81,7 +82,7 @@ def _verified(published: Published, classes: Mapping[str, type[nn.Module]]) -> d
 def _task(published: Published) -> str | None:
     """The name of the task, which must not lead to another file."""
     task, where = published.config.get("task"), published.directory / CONFIG
-    if task is not None and not (isinstance(task, str) and re.fullmatch(r"[\w-]+(@\w+)?", task)):
+    if task is not None and not (isinstance(task, str) and _TASK.fullmatch(task)):
         raise UserError(f"{where}: task is {str(task)[:80]!r}, expected the name of a task")
     if published.config.get("task_definition") is not None:
         restore_task(published.config, where)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from dds_lightning.errors import UserError
 from dds_lightning.rollout.actors import Contestant, single_skills
+from dds_lightning.study.loose import advice
 from dds_lightning.tasks import Task
 
 if TYPE_CHECKING:
@@ -120,7 +121,7 @@ def agent_directory(directory: Path) -> Path:
     there = ", ".join(sorted(entry.name for entry in directory.iterdir())) or "nothing"
     raise UserError(
         f"{directory} is neither a finished run (no agent/model.safetensors) nor a published checkpoint: "
-        f"it holds {there}"
+        f"it holds {there}{advice(directory)}"
     )
 
 

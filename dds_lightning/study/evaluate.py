@@ -14,16 +14,19 @@ from dds_lightning.rollout.play import rollout
 from dds_lightning.saving.published import CONFIG, load_published
 from dds_lightning.saving.untrusted import conform
 from dds_lightning.study.contestants import agent_directory, best_directory, way
+from dds_lightning.study.loose import loose_agent, loose_task
 from dds_lightning.study.protocol import BEST, LAST, heading, paper_line, protocol
-from dds_lightning.tasks import Task, get_task, restore_task
+from dds_lightning.tasks import Task
 
 
 def evaluate(
-    directory: Path,
+    directory: Path | None,
     *,
+    skill: str | None = None,
+    policy: str | None = None,
     task: str | None = None,
     episodes: int | None = None,
-    selection: Sequence[str] = ("greedy", "sample"),
+    selection: str | Sequence[str] = ("greedy", "sample"),
     temperature: float = 1.0,
     noise_scale: float | None = None,
     checkpoint: Literal["last", "best", "both"] = "both",
@@ -38,20 +41,33 @@ def evaluate(
     Raises:
         UserError: There is no agent or no such checkpoint, or it does not fit the task or the selection.
     """
-    places = _places(directory, checkpoint)
+    if (directory is None) == (skill is None):
+        raise UserError(
+            f"the run is {directory} and --skill is {skill}: give a run or a published checkpoint, or the checkpoints "
+            "of trainings, --skill SKILL.ckpt --policy POLICY.ckpt"
+        )
+    if policy is not None and skill is None:
+        raise UserError(f"--policy is {policy} without --skill: give both")
+    places = {LAST: Path(policy or skill)} if skill else _places(Path(directory or ""), checkpoint)
     first = next(iter(places.values()))
-    wanted = get_task(task) if task else restore_task(load_published(first).config, first)
+    wanted = loose_task(task, policy, skill) if skill else loose_task(task, str(first))
     if wanted is None:
-        raise UserError(f"{first} does not say which task it is for: give --task")
+        raise UserError(f"{first} does not say which task it is for: give --task; `dds tasks` lists them")
     count = wanted.evaluation_episodes if episodes is None else episodes
     if count < 1:
         raise UserError(f"--episodes is {count}, expected at least 1")
-    agents = {kind: _agent(place, wanted, seed, noise_scale) for kind, place in places.items()}
+    acting: dict[str, Any] = {"seed": seed, **({} if noise_scale is None else {"noise_scale": noise_scale})}
+    agents = {
+        kind: loose_agent(skill, policy, **acting) if skill else DDSAgent.load(place, **acting)
+        for kind, place in places.items()
+    }
+    for kind, agent in agents.items():
+        refuse_other_task(agent, places[kind], wanted)
     best = _best_facts(places[BEST]) if BEST in places else None
     players: list[Contestant] = []
     shown: dict[str, str] = {}
     for kind, agent in agents.items():
-        for choice in dict.fromkeys(selection):
+        for choice in [selection] if isinstance(selection, str) else dict.fromkeys(selection):
             heat = temperature if choice == "sample" else 1.0
             players.append(way(agent, choice, count, heat, best if kind == BEST else None))
             shown[players[-1].name] = kind
@@ -98,13 +114,15 @@ def _places(directory: Path, checkpoint: str) -> dict[str, Path]:
     return {checkpoint: places[checkpoint]}
 
 
-def _agent(path: Path, task: Task, seed: int, noise_scale: float | None) -> DDSAgent:
-    chosen = {} if noise_scale is None else {"noise_scale": noise_scale}
-    agent = DDSAgent.load(path, seed=seed, **chosen)
+def refuse_other_task(agent: DDSAgent, path: Path, task: Task) -> None:
+    """Refuse an agent whose widths are not the task's.
+
+    Raises:
+        UserError: It was trained for another task.
+    """
     found, expected = (agent.observation_dim, agent.action_dim), (task.observation_dim, task.action_dim)
     if found != expected:
         raise UserError(
             f"the agent in {path} has (observation_dim, action_dim) {found}, task {task.name} has {expected}: it was "
             "trained for another task"
         )
-    return agent

@@ -21,6 +21,7 @@ from dds_lightning.saving.untrusted import conform
 from dds_lightning.skill import SkillModule
 from dds_lightning.study.contestants import agent_directory, way
 from dds_lightning.study.findings import Findings
+from dds_lightning.study.loose import loose_task
 from dds_lightning.study.run_task import recall_task
 from dds_lightning.tasks import Task, get_task, known_task, restore_task
 
@@ -46,18 +47,21 @@ class Subject:
     about: str
 
 
-def find_subject(place: Path, seed: int = 0) -> Subject:
+def find_subject(place: Path, seed: int = 0, asked: str | None = None) -> Subject:
     """Determine what a path holds.
 
     Args:
         place: A run of `dds run` with at least its skills trained, a published directory, or a skill checkpoint.
         seed: Seed of the agent.
+        asked: Name of the task that was asked for, if one was.
 
     Raises:
         UserError: The path holds none of these.
     """
     if place.is_file() or place.suffix == ".ckpt":
-        return Subject(_skills_alone(place, seed), None, None, None, f"skill checkpoint {_shown(place)}")
+        agent, trained = _skills_alone(place, seed), loose_task(asked, str(place))
+        name = trained.name if trained else None
+        return Subject(agent, name, None, None, f"skill checkpoint {_shown(place)}")
     recall_task(place)
     data, task = _data_of(place)
     if not (place / "model.safetensors").is_file() and not (place / "agent" / "model.safetensors").is_file():
@@ -113,7 +117,7 @@ def atlas(
     from datamodules.sources import load_trajectories
 
     announce("looking at the checkpoint")
-    subject = find_subject(place, seed)
+    subject = find_subject(place, seed, task)
     spec, name = data or subject.data, task or subject.task
     if spec is None:
         raise UserError(f"{place} does not know its data: give --data, for example local:DIR, minari:ID or d4rl:FILE")

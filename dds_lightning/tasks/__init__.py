@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,14 +37,20 @@ def get_task(name: str | Task) -> Task:
 
     Args:
         name: `NAME` or `NAME@VARIANT` of the table, the path of a task file, `package.module:NAME` of a `Task`, or the
-            name of a custom task that this process has read before. A `Task` is returned as it is.
+            name of a custom task that this process has read before. In mazes `?goal=ROW,COLUMN`, `?start=ROW,COLUMN`
+            or `?start=ROW,COLUMN&goal=ROW,COLUMN` may follow. A `Task` is returned as it is.
 
     Raises:
         UserError: There is no such task; the message lists the nearest names.
     """
     if not isinstance(name, str):
         return name
-    return remember(load_task(name)) if is_address(name) else known_task(name)
+    address, _, cells = name.partition("?")
+    if not is_address(address):
+        return known_task(name)
+    found = load_task(address)
+    task = known_task(found) if isinstance(found, str) else remember(found)
+    return _moved(task, cells)
 
 
 def known_task(name: str) -> Task:
@@ -52,13 +59,37 @@ def known_task(name: str) -> Task:
     Raises:
         UserError: There is no such task; the message lists the nearest names.
     """
-    base, at, physics = name.partition("@")
+    whole, _, cells = name.partition("?")
+    base, at, physics = whole.partition("@")
     if base in _OWN and not at:
-        return _OWN[base]
+        return _moved(_OWN[base], cells)
     if base not in _TABLE:
         near = difflib.get_close_matches(base, _TABLE, n=3, cutoff=0.5) or list(_TABLE)
         raise UserError(f"task: there is no task '{base}'; did you mean {', '.join(near)}? See `dds tasks`")
-    return _TABLE[base].variant(physics) if at else _TABLE[base]
+    return _moved(_TABLE[base].variant(physics) if at else _TABLE[base], cells)
+
+
+def _moved(task: Task, cells: str) -> Task:
+    """Return a task with the start and goal of `start=ROW,COLUMN&goal=ROW,COLUMN`, either of which may be missing.
+
+    Raises:
+        UserError: It says something else, or names no free cell.
+    """
+    if not cells:
+        return task
+    given: dict[str, tuple[int, int]] = {}
+    for part in cells.split("&"):
+        match = re.fullmatch(r"(start|goal)=(\d+),(\d+)", part)
+        if match is None or match[1] in given:
+            raise UserError(
+                f"task: '{part}' follows the ? of '{task.name}?{cells}', expected goal=ROW,COLUMN, start=ROW,COLUMN or "
+                "both, joined by &"
+            )
+        given[match[1]] = (int(match[2]), int(match[3]))
+    start, goal = (given.get(which) for which in ("start", "goal"))
+    changed = {"start": start if start != task.start_cell else None, "goal": goal if goal != task.goal_cell else None}
+    text = "&".join(f"{which}={cell[0]},{cell[1]}" for which, cell in changed.items() if cell)
+    return task.moved(f"{task.name}?{text}", changed["start"], changed["goal"]) if text else task
 
 
 def remember(task: Task) -> Task:
@@ -118,9 +149,9 @@ def task_for_env(task: Task, env_id: str) -> Task | None:
 
 
 def known_env_ids() -> frozenset[str]:
-    """Every environment whose recordings some task accepts, in any variant."""
-    everything = [one for task in ROWS for one in (task, *map(task.variant, task.variants))]
-    return frozenset(env_id for task in everything for env_id in (task.env_id, *task.data_env_ids))
+    """Every environment whose recordings some task accepts, in any variant; custom tasks that were read included."""
+    everything = [one for task in (*ROWS, *_OWN.values()) for one in (task, *map(task.variant, task.variants))]
+    return frozenset(name for task in everything for name in (task.env_id.rpartition(":")[2], *task.data_env_ids))
 
 
 def task_table() -> pd.DataFrame:

@@ -62,12 +62,12 @@ class Part(NamedTuple):
     """One array of a dictionary observation.
 
     Attributes:
-        widths: Widths that the array may have.
-        columns: How many of its first columns are read.
+        widths: Widths that the array may have; empty for any.
+        columns: How many of its first columns are read; None for all.
     """
 
     widths: tuple[int, ...]
-    columns: int
+    columns: int | None
 
 
 @dataclass(frozen=True)

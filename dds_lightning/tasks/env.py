@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dds_lightning.envs.build import build_env
+from dds_lightning.envs.flatten import flatten
 from dds_lightning.envs.kitchen import goal_vector, kitchen_layout
 from dds_lightning.tasks.bodies import body_of
 
@@ -45,14 +46,37 @@ def open_env(task: Task) -> Iterator[gym.Env[Flat, Flat]]:
         env.close()
 
 
-class TaskEnv(gym.Wrapper[Flat, Flat, Any, Any]):
-    """An environment whose observations are already flat, and which reports `success` itself or not at all."""
+class TaskEnv(gym.Wrapper[Flat, Flat, Any, Any], gym.utils.RecordConstructorArgs):
+    """An environment whose observations are one array or a dictionary of them, with or without `success` in `info`."""
 
     def __init__(self, env: gym.Env[Any, Any], task: Task) -> None:
         """Wrap `env`, which must come from `build_env`."""
-        super().__init__(env)
+        gym.utils.RecordConstructorArgs.__init__(self, task=task, _disable_deepcopy=True)  # `spec` makes it again
         self.task = task
+        gym.Wrapper.__init__(self, env)
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (task.observation_dim,), np.float32)
+
+    @property
+    def unwrapped(self) -> gym.Env[Any, Any]:
+        """The simulator's environment; this one where that takes goals, for this one does not.
+
+        Whoever looks for `compute_reward` to recognise an environment with goals (stable-baselines3's HER) would
+        expect a goal in the observations. All other attributes of the simulator's environment are read and set here.
+        """
+        inner = self.env.unwrapped
+        return self if hasattr(inner, "compute_reward") else inner
+
+    def __getattr__(self, name: str) -> Any:
+        """Return an attribute of the simulator's environment, see `unwrapped`."""
+        if name in ("compute_reward", "env") or name.startswith("__"):
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+        return getattr(self.env.unwrapped, name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set an attribute, of the simulator's environment if that has it and this one does not."""
+        inner = self.env.unwrapped if "env" in vars(self) else self
+        own = name in vars(self) or hasattr(type(self), name) or not hasattr(inner, name)
+        object.__setattr__(self if own else inner, name, value)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Flat, dict[str, Any]]:
         """Start an episode."""
@@ -67,12 +91,13 @@ class TaskEnv(gym.Wrapper[Flat, Flat, Any, Any]):
 
     def _outside(self, observation: Any, info: dict[str, Any]) -> tuple[Flat, dict[str, Any]]:
         """Return the observation for the agent and the `info` for the caller."""
-        info["success"] = bool(info.get("success", False))
+        info["success"] = bool(info.get("success", info.get("is_success", False)))
         return np.asarray(self.flatten(observation), dtype=np.float32), info
 
     def flatten(self, observation: Any) -> Any:
         """The task's flat observation, (O,)."""
-        return observation
+        keys = self.task.observation_keys
+        return flatten(observation, keys) if keys else observation
 
 
 class MazeEnv(TaskEnv):

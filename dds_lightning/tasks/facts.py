@@ -159,7 +159,8 @@ def _maze_lines(task: Task) -> list[tuple[str, str]]:
     goal = f"{_cell(task, task.goal_cell)}, reached within {task.goal_radius:g} m"
     if task.goal_noise:
         goal += f"; each episode moves it, on average {task.goal_noise:g} m along x and along y"
-    centre = "the maze, y grows up" if task.origin == "centre" else "the start cell, y grows down"
+    home = "the start cell" if task.origin_cell in (None, task.start_cell) else f"cell {task.origin_cell}"
+    centre = "the maze, y grows up" if task.origin == "centre" else f"{home}, y grows down"
     return [
         ("maze", f"cells of {task.cell_size:g} m; (0, 0) is the middle of {centre} the drawing"),
         ("start", _cell(task, task.start_cell)),
@@ -178,14 +179,16 @@ def _place(task: Task, cell: Cell | None) -> dict[str, Any] | None:
 
 def _variants(task: Task) -> dict[str, dict[str, Any]]:
     """Return the task's variants: name -> what is different there, as numbers and as text."""
-    base = get_task(task.base_name)
+    _, mark, cells = task.name.partition("?")
+    base = get_task(f"{task.base_name}{mark}{cells}")
+    others = {name: get_task(f"{task.base_name}@{name}{mark}{cells}") for name in task.variants}
     found = {}
     for physics in task.variants:
-        other = base if physics == base.physics else get_task(f"{task.base_name}@{physics}")
+        other = base if physics == base.physics else others[physics]
         numbers = {
             label: getattr(other, name)
             for name, label in _NUMBERS.items()
-            if len({getattr(get_task(f"{task.base_name}@{one}"), name) for one in task.variants}) > 1
+            if len({getattr(one, name) for one in others.values()}) > 1
         }
         text = _PHYSICS.get((task.base_name.partition("-")[0], physics), "")
         found[other.name] = {"physics": physics, **numbers, "words": text}

@@ -7,7 +7,13 @@ score_min: -43                # the return that scores 0, for example of random 
 score_max: -4                 # the return that scores 100, for example of an expert
 ```
 
-Other attributes of a `Task` are optional; if not given, widths and action bounds are read from the environment.
+Other attributes of a `Task` are optional; if not given, widths and action bounds are read from the environment. Where
+its observations are a dictionary, `observation_keys` says which entries are put end to end, in which order:
+`[observation, desired_goal]` shows the goal to the agent, `[observation]` does not. `action_low` and `action_high` are
+the bounds of actions, `measures_success: true` counts episodes whose `info` says `success` or `is_success`.
+A file may also give a maze of the table another goal or start cell: `task: pointmaze-large-diverse` with
+`goal: [7, 1]` or `start: [1, 1]`, (row, column), is what `pointmaze-large-diverse?goal=7,1` is on the command line.
+
 `positions` and `velocities` say which observations are the simulator's qpos and qvel, which `dds data check --replay`
 needs.
 """
@@ -16,6 +22,7 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import math
 import re
 import sys
 from collections.abc import Mapping
@@ -33,7 +40,16 @@ from dds_lightning.tasks.task import Task
 LARGEST = 100_000
 """Bytes of a task file."""
 GIVEN = (
-    *("name", "env_id", "env_options", "observation_dim", "action_dim", "action_low", "action_high"),
+    *(
+        "name",
+        "env_id",
+        "env_options",
+        "observation_keys",
+        "observation_dim",
+        "action_dim",
+        "action_low",
+        "action_high",
+    ),
     *("max_episode_steps", "step_seconds", "observation_layout", "family", "measures_success"),
     *("reward_scale", "reward_shift", "score_min", "score_max", "evaluation_episodes"),
 )
@@ -41,6 +57,7 @@ GIVEN = (
 STATE = ("positions", "velocities", "hidden")
 """Fields that say where the simulator's state is in an observation."""
 NEEDED = ("env_id", "max_episode_steps", "score_min", "score_max")
+_FLAT = "expected a Box (n,); wrap the environment so that they are flat, and register it with Gymnasium"
 FAMILY = "default"
 """Preset of tasks that do not name one."""
 _KINDS: dict[str, tuple[str, type | tuple[type, ...]]] = {
@@ -49,6 +66,7 @@ _KINDS: dict[str, tuple[str, type | tuple[type, ...]]] = {
     "float": ("a number", (int, float)),
     "bool": ("true or false", bool),
     "Mapping[str, Any]": ("a mapping of names to values", dict),
+    "tuple[str, ...]": ("a list of names", list),
 }
 
 
@@ -57,12 +75,15 @@ def is_address(name: str) -> bool:
     return name.endswith((".yaml", ".yml")) or re.fullmatch(r"[\w.]+:\w+", name) is not None
 
 
-def load_task(address: str) -> Task:
-    """Read a task from a YAML file or from a Python module.
+def load_task(address: str) -> Task | str:
+    """Read a task from a YAML file or from a Python module; a file may also change the cells of a task of the table.
 
     Args:
         address: Path that ends in `.yaml`, or `package.module:NAME` of a `Task`; the module is imported, which executes
             its code.
+
+    Returns:
+        The task, or the name of one, `NAME?goal=ROW,COLUMN`.
 
     Raises:
         UserError: It cannot be read or is not a task; the message names the field, its value and what was expected.
@@ -77,13 +98,26 @@ def load_task(address: str) -> Task:
     given = read_yaml(path, LARGEST, verdict="is not valid YAML", remedy="mend it")
     if not isinstance(given, dict):
         raise UserError(f"task: {path} is not a mapping, expected for example env_id: Reacher-v5")
-    return build_task({"name": path.stem, **given}, str(path))
+    return _cells(given, str(path)) if "task" in given else build_task({"name": path.stem, **given}, str(path))
+
+
+def _cells(given: Mapping[str, Any], where: str) -> str:
+    """Return the name that a file with `task`, and `start` or `goal` or both, stands for."""
+    found = {which: given[which] for which in ("start", "goal") if given.get(which) is not None}
+    if unknown := set(given) - {"task", "start", "goal"}:
+        raise UserError(f"task: {where} sets task and {min(unknown)}; beside a task it may set start and goal")
+    for which, cell in found.items():
+        if not isinstance(cell, list) or len(cell) != 2 or not all(type(i) is int and i >= 0 for i in cell):
+            raise UserError(f"task: {where} sets {which} to {cell!r}, expected a cell, [row, column]")
+    return f"{given['task']}?{'&'.join(f'{which}={i},{j}' for which, (i, j) in found.items())}"
 
 
 def definition(task: Task) -> dict[str, Any]:
     """Return a custom task as plain values, from which `build_task` restores it."""
     values: dict[str, Any] = {name: getattr(task, name) for name in GIVEN}
     values["env_options"] = dict(values["env_options"])
+    if keys := values.pop("observation_keys"):
+        values["observation_keys"] = list(keys)
     if task.body == task.name and has_state(task):
         layout = state_layout(task, task.observation_dim)
         values |= {"positions": list(layout.positions), "velocities": list(layout.velocities), "hidden": layout.hidden}
@@ -117,6 +151,7 @@ def build_task(given: Mapping[str, Any], where: str, trusted: bool = True) -> Ta
         if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
             raise UserError(f"task: {where} sets {name} to {value!r}, expected {description}")
         values[name] = float(str(value)) if types[name] == "float" else value
+    values["observation_keys"] = tuple(values.get("observation_keys", ()))
     _check(values, where, trusted)
     asked = {} if not trusted and "observation_dim" in values else _read_environment(values, where)
     values = {"family": FAMILY, "measures_success": False, **asked, **values}
@@ -136,6 +171,7 @@ def _check(values: Mapping[str, Any], where: str, trusted: bool) -> None:
         ("max_episode_steps", trusted or values["max_episode_steps"] <= 10**6, "at most a million"),
         ("evaluation_episodes", trusted or values.get("evaluation_episodes", 1) <= 10**5, "at most 100,000"),
         ("score_max", values["score_max"] > values["score_min"], f"more than score_min={values['score_min']}"),
+        ("observation_keys", _are_names(values["observation_keys"]), "names of entries, each once"),
         *((name, values.get(name, 1) >= 1, "at least 1") for name in ("observation_dim", "action_dim")),
         ("evaluation_episodes", values.get("evaluation_episodes", 1) >= 1, "at least 1"),
         ("step_seconds", values.get("step_seconds", 1.0) > 0, "a positive number"),
@@ -152,11 +188,15 @@ def _check(values: Mapping[str, Any], where: str, trusted: bool) -> None:
             raise UserError(f"task: {where} sets {name} to {values[name]!r}, expected a finite number")
 
 
+def _are_names(keys: tuple[Any, ...]) -> bool:
+    return all(isinstance(key, str) for key in keys) and len(set(keys)) == len(keys)
+
+
 def _read_environment(values: Mapping[str, Any], where: str) -> dict[str, Any]:
     """Read widths, action bounds and the length of a step from the environment.
 
     Raises:
-        UserError: Gymnasium does not know it, or its spaces are not flat.
+        UserError: Gymnasium does not know it, or its spaces are not those of one flat array.
     """
     import gymnasium as gym
 
@@ -167,22 +207,16 @@ def _read_environment(values: Mapping[str, Any], where: str) -> dict[str, Any]:
     except (gym.error.Error, ImportError, TypeError, ValueError) as error:
         raise UserError(f"task: {where} sets env_id to {values['env_id']}: {str(error).splitlines()[0]}") from None
     try:
-        seen, taken = env.observation_space, env.action_space
-        for name, space in (("observations", seen), ("actions", taken)):
-            if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
-                raise UserError(
-                    f"task: {where}: the {name} of {values['env_id']} are {space}, expected a Box (n,); wrap the "
-                    "environment so that they are flat, and register it with Gymnasium"
-                )
-        assert isinstance(seen, gym.spaces.Box)
-        assert isinstance(taken, gym.spaces.Box)
+        width, taken = _observation_width(env.observation_space, values, where), env.action_space
+        if not isinstance(taken, gym.spaces.Box) or len(taken.shape) != 1:
+            raise UserError(f"task: {where}: the actions of {values['env_id']} are {taken}, {_FLAT}")
         low, high = np.unique(taken.low), np.unique(taken.high)
         if "action_low" not in values and (len(low) > 1 or len(high) > 1 or not np.isfinite([*low, *high]).all()):
             raise UserError(
                 f"task: {where}: the actions of {values['env_id']} have bounds {taken.low} to {taken.high}, expected "
                 "the same finite ones for every entry; rescale them with gymnasium.wrappers.RescaleAction"
             )
-        found = {"observation_dim": seen.shape[0], "action_dim": taken.shape[0]}
+        found = {"observation_dim": width, "action_dim": taken.shape[0]}
         for name, width in found.items():
             if values.get(name, width) != width:
                 raise UserError(f"task: {where} sets {name} to {values[name]}, but {values['env_id']} has {width}")
@@ -190,6 +224,35 @@ def _read_environment(values: Mapping[str, Any], where: str) -> dict[str, Any]:
         return {**found, "action_low": float(low[0]), "action_high": float(high[0]), "step_seconds": float(seconds)}
     finally:
         env.close()
+
+
+def _observation_width(space: Any, values: Mapping[str, Any], where: str) -> int:
+    """O of a Box, or of the entries of a Dict that `observation_keys` names.
+
+    Raises:
+        UserError: It is another space, or the names do not fit it; the message lists the entries.
+    """
+    import gymnasium as gym
+
+    keys, about = list(values["observation_keys"]), f"the observations of {values['env_id']} are"
+    if isinstance(space, gym.spaces.Dict):
+        shapes = {name: inner.shape for name, inner in space.items() if isinstance(inner, gym.spaces.Box)}
+        if keys and set(keys) <= set(shapes):
+            return sum(math.prod(shapes[key]) for key in keys)
+        entries = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+        plain = [name for name in shapes if name not in ("achieved_goal", "desired_goal")]
+        goal = f" or, with the goal, [{', '.join([*plain, 'desired_goal'])}]" if "desired_goal" in shapes else ""
+        problem = (
+            f"{about} a dictionary of {entries}: set observation_keys to those that are put end to end, for example "
+            f"[{', '.join(plain)}]{goal}{f'; it is {keys}' if keys else ''}"
+        )
+    elif not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
+        problem = f"{about} {space}, {_FLAT}"
+    elif keys:
+        problem = f"{about} one array, {space}: leave out observation_keys, which is {keys}"
+    else:
+        return int(space.shape[0])
+    raise UserError(f"task: {where}: {problem}")
 
 
 def _body(task: Task, layout: Mapping[str, Any], where: str) -> Body:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -37,6 +38,8 @@ class Task:
         max_episode_steps: Steps after which an evaluation episode is truncated.
         step_seconds: Simulated seconds per step.
         env_options: Further arguments to the environment's constructor.
+        observation_keys: Entries of a dictionary observation that are put end to end, in this order; one of them may
+            be the goal. Empty where the observation is one array.
         adapter: How the environment's observations are flattened: "flat" takes them as they are, "maze" and
             "kitchen" read gymnasium-robotics' dictionaries.
         physics: Name of this variant; "" if there is only one.
@@ -46,6 +49,7 @@ class Task:
         cell_size: Side of a cell in metres.
         origin: Where (0, 0) lies: in the maze's "centre" with y up (gymnasium-robotics), or in the middle of
             the "start" cell with y growing down the map (D4RL).
+        origin_cell: The cell in whose middle (0, 0) lies where `origin` is "start"; None takes `start_cell`.
         start_cell: (row, column) where evaluation episodes start.
         goal_cell: (row, column) of the one goal.
         goal_radius: Distance to the goal in metres that counts as success.
@@ -80,12 +84,14 @@ class Task:
     action_low: float = -1.0
     action_high: float = 1.0
     env_options: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    observation_keys: tuple[str, ...] = ()
     adapter: Literal["flat", "maze", "kitchen"] = "flat"
     physics: str = ""
     variants: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, hash=False, repr=False)
     maze_map: tuple[str, ...] | None = None
     cell_size: float = 1.0
     origin: Literal["centre", "start"] = "centre"
+    origin_cell: Cell | None = None
     start_cell: Cell | None = None
     goal_cell: Cell | None = None
     goal_radius: float = 0.45
@@ -117,21 +123,69 @@ class Task:
             known = ", ".join(f"{self.base_name}@{name}" for name in self.variants) or "no variants"
             raise UserError(f"task: '{self.base_name}' has no physics '{physics}'; it has {known}")
         changes = {"physics": physics, **self.variants[physics]}
-        return replace(self, name=f"{self.base_name}@{physics}", **changes)
+        _, mark, cells = self.name.partition("?")
+        return replace(self, name=f"{self.base_name}@{physics}{mark}{cells}", **changes)
 
     @property
     def base_name(self) -> str:
-        """The name without `@VARIANT`."""
-        return self.name.partition("@")[0]
+        """The name without `@VARIANT` and `?CELLS`."""
+        return re.split("[@?]", self.name, maxsplit=1)[0]
+
+    @property
+    def file_name(self) -> str:
+        """The name without characters that shells or other programs take for something else."""
+        return re.sub("[?&=,]", "-", self.name)
 
     @property
     def is_pinned(self) -> bool:
         """Whether the name says which physics is meant; otherwise the data may choose."""
         return "@" in self.name
 
+    def moved(self, name: str, start: Cell | None, goal: Cell | None) -> Task:
+        """Return the same maze from another start cell or to another goal cell.
+
+        The data are the same, but whatever goal they were recorded with, their rewards become those of the new one.
+
+        Args:
+            name: Of the new task.
+            start: (row, column) where episodes start; None leaves it.
+            goal: (row, column) of the goal; None leaves it.
+
+        Raises:
+            UserError: There is no maze, or a cell is a wall or outside.
+        """
+        cells = {"start": start or self.start_cell, "goal": goal or self.goal_cell}
+        for which, cell in cells.items():
+            if cell not in self.free_cells():
+                raise UserError(
+                    f"task: {which} is {cell}, a wall or outside the maze of '{self.name}', expected row,column of a "
+                    f"free cell; `dds tasks {self.base_name}` draws them"
+                )
+        if cells["start"] == cells["goal"]:
+            raise UserError(f"task: start and goal of '{self.name}' are both {cells['goal']}, expected two cells")
+        changes: dict[str, Any] = {"data_reward": "goal"} if goal else {}
+        # D4RL's environments draw goal and pose themselves, around the cells that they were made with.
+        options = {"reset_cell": cells["start"], "goal_cell": cells["goal"]}
+        variants = {
+            physics: {**differing, **changes, "env_options": {} if differing.get("adapter") == "maze" else options}
+            for physics, differing in self.variants.items()
+        }
+        if variants:
+            changes = {key: variants[self.physics][key] for key in ("env_options", *changes)}
+        return replace(
+            self,
+            name=name,
+            variants=variants,
+            origin_cell=self.origin_cell or self.start_cell,
+            start_cell=cells["start"],
+            goal_cell=cells["goal"],
+            paper_score=None,
+            **changes,
+        )
+
     def accepts(self, env_id: str) -> bool:
         """Whether recordings from an environment fit this task without changes."""
-        return env_id == self.env_id or env_id in self.data_env_ids
+        return env_id == self.env_id.rpartition(":")[2] or env_id in self.data_env_ids
 
     # ------------------------------------------------------------------ geometry
 
@@ -187,8 +241,9 @@ class Task:
         rows = self._maze()
         if self.origin == "centre":
             return (len(rows) - 1) / 2, (len(rows[0]) - 1) / 2, -1
-        assert self.start_cell is not None, "a frame at the start cell needs one"
-        return float(self.start_cell[0]), float(self.start_cell[1]), 1
+        home = self.origin_cell or self.start_cell
+        assert home is not None, "a frame at the start cell needs one"
+        return float(home[0]), float(home[1]), 1
 
     def _maze(self) -> tuple[str, ...]:
         if self.maze_map is None:

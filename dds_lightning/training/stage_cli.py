@@ -24,6 +24,7 @@ from dds_lightning.callbacks.best import BestCheckpoint
 from dds_lightning.callbacks.convergence import Convergence
 from dds_lightning.callbacks.rolling import RollingCheckpoint
 from dds_lightning.configs import resolve_configs
+from dds_lightning.console.arguments import as_lists, list_options
 from dds_lightning.console.reports import Report, table
 from dds_lightning.errors import UserError
 from dds_lightning.finetune import read
@@ -52,7 +53,8 @@ class StageCLI(LightningCLI):
     def __init__(self, stage: str, arguments: Sequence[str], parse_only: bool = False) -> None:
         self.stage = get_stage(stage)
         self.parse_only = parse_only
-        self.arguments = resolve_configs(arguments)
+        options = list_options(self.stage.module_class(), "model.") | list_options(self.stage.data_class(), "data.")
+        self.arguments = as_lists(resolve_configs(arguments), options)
         self.checkpoint: dict[str, Any] | None = None
         self.measured_precision: str | None = None
         parser = {"exit_on_error": False}

@@ -17,7 +17,7 @@ from dds_lightning.callbacks.best import BestCheckpoint
 from dds_lightning.callbacks.guard import FiniteGuard
 from dds_lightning.callbacks.resume import ExactResume
 from dds_lightning.callbacks.rolling import RollingCheckpoint
-from dds_lightning.saving.checkpoint import AtomicCheckpointIO
+from dds_lightning.saving.checkpoint import SETTINGS_KEY, AtomicCheckpointIO
 from dds_lightning.training.progress import StepProgress
 
 
@@ -28,7 +28,7 @@ class TrainingSettings(Callback):
         settings: Dotted name -> plain value.
     """
 
-    KEY = "settings"
+    KEY = SETTINGS_KEY
     """Entry of the checkpoint."""
 
     def __init__(self, settings: dict[str, Any]) -> None:

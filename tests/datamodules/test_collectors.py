@@ -9,6 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import minari
 import numpy as np
 import pytest
 
@@ -90,7 +91,7 @@ class ToyActor:
 
 def plan_toys(task: Task, seed: int, steps: int, recipe: ToyRecipe) -> DataSetPlan:
     env = build_env(task.env_id)
-    return DataSetPlan(ToyRecorder(steps, recipe), env, env.observation_space, "toy", "toys", {"toys": 1})
+    return DataSetPlan(ToyRecorder(steps, recipe), env, "toy", "toys", {"toys": 1})
 
 
 @pytest.fixture
@@ -205,3 +206,25 @@ def test_a_collected_set_knows_the_command_that_makes_it_again(tmp_path: Path) -
     (folder / "data" / "metadata.json").write_text(json.dumps(stranger))
     assert collection_command(folder) is None
     assert collection_command(tmp_path) is None
+
+
+# ---------------------------------------------------------------------- Minari's side
+
+
+def first_row(rows: Any) -> Any:
+    return {key: first_row(inner) for key, inner in rows.items()} if isinstance(rows, dict) else rows[0]
+
+
+@pytest.mark.parametrize("name", [POINT, "antmaze-umaze-diverse", "hopper-medium", "kitchen-mixed"])
+def test_observations_are_stored_as_the_environment_declares_them(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = collect(name, 300, 0, tmp_path, workers=1)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    stored = minari.load_dataset(folder.name)
+    env = stored.recover_environment()
+    assert stored.observation_space == env.observation_space
+    assert env.observation_space.contains(first_row(stored[0].observations))
+    description = stored.storage.metadata["description"]
+    assert ("install it from its checkout" in description) == name.startswith("antmaze")
+    env.close()

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules.inspection import BLOCK, check_dataset, describe, dimension_table, episode_table, visits
+from datamodules.inspection import BLOCK, check_dataset, count_repeats, describe, dimension_table, episode_table, visits
 from datamodules.trajectories import DataError, Trajectories
+from dds_lightning.cli import main
 from dds_lightning.tasks import get_task
 
 Make = Callable[..., dict[str, Any]]
@@ -110,3 +111,15 @@ def one_episode(observations: np.ndarray, actions: np.ndarray) -> Trajectories:
         action_low=-width,
         action_high=width,
     )
+
+
+def test_identical_episodes_are_counted_and_said(make_episode: Make, tmp_path: Path, capsys: Any) -> None:
+    one, other = make_episode(5, 0), make_episode(5, 1)
+    assert count_repeats(Trajectories.from_episodes("made", [one, other])) == 0
+    data = Trajectories.from_episodes("made", [one, other, one, one])
+    assert count_repeats(data) == describe(data)[0]["repeated episodes"] == 2
+    nearly = {**one, "actions": np.nextafter(np.asarray(one["actions"], np.float32), np.float32(0))}
+    assert count_repeats(Trajectories.from_episodes("made", [one, nearly])) == 1 - int(np.any(one["actions"]))
+    data.save(tmp_path / "data")
+    assert main(["data", "check", f"arrays:{tmp_path / 'data'}"]) == 0
+    assert "2 of the 4 episodes repeat an earlier one to the bit" in " ".join(capsys.readouterr().out.split())

@@ -262,7 +262,7 @@ def test_a_set_that_minari_wrote_is_read(tmp_path: Path, monkeypatch: pytest.Mon
         for number, episode in enumerate(episodes)
     ]
     env = task.make_env()
-    minari.create_dataset_from_buffers("antmaze-v0", buffers, env=env.unwrapped.spec)
+    minari.create_dataset_from_buffers("antmaze-v0", buffers, env=env.env.unwrapped.spec)
     env.close()
     _same(load_trajectories("minari:antmaze-v0", "antmaze-umaze"), episodes)
 

@@ -90,7 +90,7 @@ def test_a_repository_that_is_not_there_is_one_sentence(hub):
 
 def test_without_the_extra_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    with pytest.raises(UserError, match=r"pip install -e '\.\[hub\]'` in the folder of this project's checkout"):
+    with pytest.raises(UserError, match=r"pip install -e '\.\[hub\]' -c constraints.txt` in this project's checkout"):
         pull("hf:somebody/maze")
 
 

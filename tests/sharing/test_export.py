@@ -24,16 +24,12 @@ from dds_lightning.sharing.export import (
 from dds_lightning.skill import SkillModule
 
 K = 5
-FORMATS = [
-    "torch",
-    pytest.param(
-        "onnx",
-        marks=pytest.mark.skipif(
-            any(importlib.util.find_spec(name) is None for name in ("onnx", "onnxscript", "onnxruntime")),
-            reason="needs the extra 'export'",
-        ),
-    ),
-]
+SHIPPED = Path(__file__).parents[2] / "checkpoints"
+NEEDS_ONNX = pytest.mark.skipif(
+    any(importlib.util.find_spec(name) is None for name in ("onnx", "onnxscript", "onnxruntime")),
+    reason="needs the extra 'export'",
+)
+FORMATS = ["torch", pytest.param("onnx", marks=NEEDS_ONNX)]
 
 
 def make_agent(decoder="diffusion", sampler="ddpm", fourier_features=0, **settings):
@@ -121,6 +117,26 @@ def test_every_decoder_and_way_of_choosing_can_be_traced(settings, draws, tmp_pa
     assert check_exported(agent, path)["difference"] <= 1e-5
 
 
+@NEEDS_ONNX
+def test_it_is_compared_where_the_data_are_and_in_parts_of_the_actions_range(tmp_path):
+    agent = make_agent()
+    agent.skill.normaliser.fit(torch.tensor([0.0, 1e3, -5.0, 1.0]), torch.tensor([1e-3, 10.0, 1e-3, 4.0]))
+    agent.policy.normaliser.fit(agent.skill.normaliser.mean, agent.skill.normaliser.std)
+    agent.skill.action_box.fit(torch.tensor([-400.0, -1.0]), torch.tensor([600.0, 1.0]))
+    seen = agent.skill.normaliser(example_inputs(agent, 500)[0])
+    np.testing.assert_allclose(seen.mean(0), 0, atol=0.2)
+    np.testing.assert_allclose(seen.std(0), 1, atol=0.2)
+    assert check_exported(agent, export_agent(agent, tmp_path / "agent.onnx"))["difference"] <= 1e-5
+
+
+@NEEDS_ONNX
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(path.parent.name for path in SHIPPED.glob("*/model.safetensors")))
+def test_every_shipped_agent_exports(name, tmp_path):
+    agent = DDSAgent.load(SHIPPED / name)
+    assert check_exported(agent, export_agent(agent, tmp_path / "agent.onnx"))["difference"] <= 1e-5
+
+
 def test_what_needs_no_policy_is_refused_and_nothing_is_written(tmp_path):
     agent = make_agent().variant("random")
     with pytest.raises(UserError, match=r"selection is 'random'.*sample, greedy or argmax_q"):
@@ -153,12 +169,9 @@ def test_the_graph_is_the_agent_in_training_mode_too(tmp_path):
     assert not ActingGraph(agent).skill.training
 
 
-@pytest.mark.skipif(
-    any(importlib.util.find_spec(name) is None for name in ("onnx", "onnxscript", "onnxruntime")),
-    reason="needs the extra 'export'",
-)
+@NEEDS_ONNX
 def test_the_example_reaches_the_goal_without_torch(tmp_path):
-    agent = DDSAgent.load(Path(__file__).parents[2] / "checkpoints" / "pointmaze-large")
+    agent = DDSAgent.load(SHIPPED / "pointmaze-large")
     path = export_agent(agent, tmp_path / "agent.onnx")
     script = Path(examples.__file__).parent / "act_with_onnx.py"
     # `-X importtime` would be long: a path hook that refuses torch is shorter and stricter.

@@ -2,7 +2,10 @@
 
 import sys
 
+import gymnasium as gym
+import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import facts_to_keep, get_task, is_own, known_task, restore_task
@@ -37,6 +40,22 @@ def test_once_read_it_is_known_by_its_name_and_its_environment_plays(tmp_path):
     env.close()
 
 
+@pytest.mark.parametrize(("keys", "width"), [(["observation"], 10), (["observation", "desired_goal"], 13)])
+def test_a_dictionary_is_flattened_with_the_goal_or_without(tmp_path, keys, width):
+    task = get_task(file(tmp_path / "reach.yaml", env_id="FetchReach-v4", observation_keys=keys, measures_success=True))
+    assert (task.observation_dim, task.observation_keys) == (width, tuple(keys))
+    assert build_task(definition(task), "here", trusted=False) == task
+    env, plain = task.make_env(), gym.make("FetchReach-v4")
+    seen, info = env.reset(seed=3)
+    expected = plain.reset(seed=3)[0]
+    np.testing.assert_allclose(seen, np.concatenate([expected[key] for key in keys]), rtol=1e-6)
+    assert info["success"] is False
+    assert env.step(env.action_space.sample())[4]["success"] is False
+    check_env(env, skip_render_check=True)
+    env.unwrapped.goal[:] = expected["achieved_goal"]
+    assert env.step(np.zeros(4))[4]["success"] is True
+
+
 def test_its_definition_makes_it_again_and_is_kept_with_agents(tmp_path):
     task = get_task(file(tmp_path / "pole.yaml", positions=[0, 1], velocities=[2, 3]))
     assert build_task(definition(task), "here") == task
@@ -62,7 +81,17 @@ def test_the_state_in_an_observation_may_be_said(tmp_path):
         ({"max_steps": 3}, r"sets max_steps, which is not known; did you mean max_episode_steps\?"),
         ({"env_id": None}, "lacks env_id"),
         ({"env_id": "Nowhere-v9"}, "sets env_id to Nowhere-v9: "),
-        ({"env_id": "FetchReach-v4"}, "the observations of FetchReach-v4 are Dict"),
+        (
+            {"env_id": "FetchReach-v4"},
+            r"a dictionary of achieved_goal \(3,\), desired_goal \(3,\), observation \(10,\): set observation_keys to "
+            r"those that are put end to end, for example \[observation\] or, with the goal, \[observation, desired",
+        ),
+        (
+            {"env_id": "FetchReach-v4", "observation_keys": ["observation", "goal"]},
+            r"; it is \['observation', 'goal'\]",
+        ),
+        ({"observation_keys": ["observation"]}, r"one array, .*: leave out observation_keys, which is \['observation'"),
+        ({"observation_keys": ["a", "a"]}, "sets observation_keys to .*, expected names of entries, each once"),
         ({"max_episode_steps": "many"}, "sets max_episode_steps to 'many', expected a whole number"),
         ({"score_max": 1}, "sets score_max to 1.0, expected more than score_min=5.0"),
         ({"observation_dim": 7}, "sets observation_dim to 7, but InvertedPendulum-v5 has 4"),

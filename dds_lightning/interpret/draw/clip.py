@@ -33,8 +33,19 @@ def write_clip(
         frames: Maximum number of frames; the episode is subsampled to fit.
         fps: Frames per second.
     """
+    count = len(episode.codes)
+    shown = np.unique(np.linspace(1, count, min(frames, count)).round().astype(int))
+    path = Path(path)
+    with written_whole(path) as part:
+        part.write_bytes(gif_bytes(maze_pictures(task, episode, shown, title), fps))
+    return path
+
+
+def maze_pictures(
+    task: Task, episode: RolloutPath, shown: NDArray[np.int64], title: str = ""
+) -> list[NDArray[np.uint8]]:
+    """Draw an episode after some of its steps, counted from 1; the rest as in `write_clip`."""
     positions, codes = np.asarray(episode.positions), np.asarray(episode.codes)
-    shown = np.unique(np.linspace(1, len(codes), min(frames, len(codes))).round().astype(int))
     figure = Figure(figsize=(4.2, 3.5), dpi=80, layout="constrained")
     ax = figure.add_subplot()
     draw_walls(ax, task)
@@ -63,10 +74,7 @@ def write_clip(
         number.set(text=str(code) if code >= 0 else "", color=ink(colour))
         caption.set_text((f"skill {code:2d}   " if code >= 0 else "") + f"step {t:3d}")
         images.append(background.frame())
-    path = Path(path)
-    with written_whole(path) as part:
-        part.write_bytes(gif_bytes(images, fps))
-    return path
+    return images
 
 
 def replay_clip(

@@ -11,6 +11,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,8 @@ COLUMNS = 6
 """Maximum number of moments shown."""
 PATIENCE = 120.0
 """Time limit of one backend in seconds."""
+PROBE = 8
+"""Frames after which a backend that would exceed the limit gives up."""
 _CODE = "from dds_lightning.interpret.draw.rendering import worker; worker()"
 
 
@@ -136,8 +139,11 @@ def _render(facts: str, qpos: NDArray[np.float64], width: int, height: int) -> N
             camera.distance, camera.azimuth, camera.elevation = view.camera
         else:
             mujoco.mjv_defaultFreeCamera(model, camera)
-        frames = []
+        frames: list[NDArray[np.uint8]] = []
+        start = time.perf_counter()
         for row in qpos:
+            if len(frames) == PROBE and (time.perf_counter() - start) / PROBE * len(qpos) > PATIENCE / 2:
+                raise TimeoutError("a driver without a graphics card")
             data.qpos[:] = row
             mujoco.mj_forward(model, data)
             torso = data.xpos[model.jnt_bodyid[0]]

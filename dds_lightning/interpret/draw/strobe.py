@@ -104,8 +104,30 @@ def body_clip(
         size: Width in inches at 80 dots per inch.
         seconds: Seconds per step; 0 takes the task's.
     """
-    view, seconds = _view(task, [body]), seconds or task.step_seconds
     shown = np.unique(np.linspace(0, len(body) - 1, min(frames, len(body))).round().astype(int))
+    pictures = body_pictures(task, body, np.full(len(body), code), shown, size, seconds)
+    return gif_bytes(pictures, fps, colours=64)
+
+
+def body_pictures(
+    task: Task,
+    body: BodyFrames,
+    codes: NDArray[Any],
+    shown: NDArray[np.int64],
+    size: float = 2.9,
+    seconds: float = 0.0,
+) -> list[NDArray[np.uint8]]:
+    """Draw a moving stick figure.
+
+    Args:
+        task: The environment.
+        body: T + 1 frames.
+        codes: (T + 1,) codes in use, which determine the colour.
+        shown: The frames to draw.
+        size: Width in inches at 80 dots per inch.
+        seconds: Seconds per step; 0 takes the task's.
+    """
+    view, seconds = _view(task, [body]), seconds or task.step_seconds
     follows = view.ground
     low, high = _window(view, [_centred(body) if follows else body])
     tall = float(np.clip(size * (high[1] - low[1]) / (high[0] - low[0]), 1.2, 0.8 * size)) + 0.3
@@ -117,7 +139,7 @@ def body_clip(
     _scene(ax, task, view, body)
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[], xlabel="", ylabel="")
     ax.spines[:].set_visible(False)
-    limbs = PolyCollection([], facecolor=skill_colour(code), edgecolor="white", linewidth=0.5, zorder=3)
+    limbs = PolyCollection([], edgecolor="white", linewidth=0.5, zorder=3)
     marks = LineCollection([], color=NO_SKILL, linewidth=1.0, zorder=2)
     for artist in (limbs, marks):
         ax.add_collection(artist)
@@ -128,6 +150,8 @@ def body_clip(
     pictures = []
     for t in shown:
         offset = np.array([body.root[t, view.axes[0]], 0.0]) if follows else np.zeros(2)
+        code = int(codes[t])
+        limbs.set_facecolor(skill_colour(code))
         limbs.set_verts(list(_capsules(body, t, view) - offset))
         joints.set_data(*(body.joints[t][:, view.axes] - offset).T)
         things.set_data(*body.objects[t][:, view.axes].T)
@@ -137,7 +161,7 @@ def body_clip(
             marks.set_segments([[(x, 0.0), (x, -0.07)] for x in places])
         caption.set_text(f"skill {code}   {t * seconds:4.2f} s   {_travel(view, body, t)}")
         pictures.append(background.frame())
-    return gif_bytes(pictures, fps, colours=64)
+    return pictures
 
 
 # ---------------------------------------------------------------------- parts

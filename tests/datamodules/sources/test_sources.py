@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules import Trajectories, load_trajectories
+from datamodules import DataError, Trajectories, load_trajectories
 from datamodules.sources import SOURCES, resolve_task
 from datamodules.sources.arrays import ARRAYS
 from datamodules.sources.rows import open_recording
@@ -100,3 +100,49 @@ def test_what_is_not_there_is_said_in_one_sentence(spec):
     with pytest.raises(UserError, match=r"nothing at|missing|not in|expected one of"):
         stat_hash(spec)
     assert list(Path().iterdir()) == []
+
+
+def _no_states(folder):
+    (folder / "observations.npy").unlink()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "task", "remedy"),
+    [
+        (None, "hopper-medium", "; choose a task that fits the data (`dds tasks`), or other data"),
+        (_no_states, None, "; write the folder again with `Trajectories.save`"),
+    ],
+)
+def test_a_refusal_of_data_says_what_helps_and_only_once(tmp_path, spoil, task, remedy):
+    last = np.arange(3) == 2
+    flags = {"terminations": last & False, "truncations": last}
+    fields = {"observations": np.zeros((4, 4)), "actions": np.zeros((3, 2)), "rewards": np.zeros(3), **flags}
+    folder = Trajectories.from_episodes("mine", [fields]).save(tmp_path / "mine")
+    if spoil is not None:
+        spoil(folder)
+    with pytest.raises(DataError) as refused:
+        load_trajectories(f"arrays:{folder}", task)
+    assert str(refused.value).endswith(remedy)
+    assert str(refused.value).count("; ") == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "remedy"),
+    [
+        (
+            {"actions": np.full((3, 2), 2.0)},
+            "for another box give action_low and action_high, to from_episodes or in the",
+        ),
+        ({"observations": np.zeros((3, 4))}, "append it, or leave out the last step"),
+        ({"observations": [{"observation": np.zeros(4)}] * 4}, "put their entries end to end"),
+        ({"truncations": [False] * 3}, "set truncations there if only the recording ended"),
+        ({"rewards": [0.0, np.nan, 0.0]}, "leave that step out"),
+    ],
+)
+def test_so_does_a_refusal_of_arrays(change, remedy):
+    last = np.arange(3) == 2
+    flags = {"terminations": last & False, "truncations": last}
+    fields = {"observations": np.zeros((4, 4)), "actions": np.zeros((3, 2)), "rewards": np.zeros(3), **flags}
+    with pytest.raises(DataError) as refused:
+        Trajectories.from_episodes("mine", [{**fields, **change}])
+    assert remedy in str(refused.value)

@@ -1,0 +1,60 @@
+"""Agents from the checkpoints of trainings, which nothing has published yet, and the task of these."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from dds_lightning.agent import DDSAgent
+from dds_lightning.errors import UserError
+from dds_lightning.policy import PolicyModule
+from dds_lightning.saving.checkpoint import load_ckpt, stage_of, trained_for
+from dds_lightning.saving.published import load_published
+from dds_lightning.skill import SkillModule
+from dds_lightning.tasks import Task, get_task, known_task, restore_task
+from dds_lightning.tasks.own import is_address
+
+
+def loose_agent(skill: str, policy: str | None = None, **acting: Any) -> DDSAgent:
+    """Put a skill checkpoint and a policy checkpoint together.
+
+    Args:
+        skill: A `.ckpt` or a published directory.
+        policy: Likewise; None for an agent that chooses its skills at random.
+        **acting: Settings of the agent.
+
+    Raises:
+        UserError: A file cannot be read, or the two do not belong together.
+    """
+    chooser = None if policy is None else PolicyModule.load(policy)
+    return DDSAgent(SkillModule.load(skill), chooser, "random" if chooser is None else "sample", **acting)
+
+
+def loose_task(asked: str | None, *checkpoints: str | None) -> Task | None:
+    """Return the task that was asked for, else the one that the first checkpoint that knows was trained for.
+
+    Raises:
+        UserError: There is no such task, or a checkpoint names a file: it does not decide what is opened.
+    """
+    if asked is not None:
+        return get_task(asked)
+    for path in map(Path, filter(None, checkpoints)):
+        if path.is_dir():
+            task = restore_task(load_published(path).config, path)
+        else:
+            name = trained_for(load_ckpt(path))
+            if name and is_address(name.partition("?")[0]):
+                raise UserError(f"{path} was trained for task {name}: give --task={name}")
+            task = known_task(name) if name else None
+        if task is not None:
+            return task
+    return None
+
+
+def advice(folder: Path) -> str:
+    """Say how to use the last checkpoint in a training's folder; "" where there is none."""
+    path = folder / "last.ckpt"
+    if not path.is_file():
+        return ""
+    words = f"--skill {path}" if stage_of(load_ckpt(path)) == "skill" else f"--skill SKILL.ckpt --policy {path}"
+    return f"; its checkpoint plays with `dds evaluate {words}` and is published with `dds publish - PLACE {words}`"
