@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import NamedTuple
 
 import torch
+from jsonargparse import Namespace
+from rich.console import Console
 from torch import nn
 
 WIDTH, ROWS, REPEATS = 128, 640, 9
@@ -52,3 +55,19 @@ def fastest_precision(use_gpu: bool = False) -> Choice:
         torch.set_num_threads(threads)
     speedup = best[False] / best[True]
     return Choice("bf16-mixed" if speedup > WORTH else "32-true", speedup)
+
+
+def settle_precision(settings: Namespace) -> str | None:
+    """Settle `precision: auto` of a training, unless the user or the checkpoint that goes on has.
+
+    Returns:
+        What was measured; None where nothing was.
+    """
+    if settings.get("precision") != "auto" or settings.trainer.precision is not None:
+        return None
+    use_gpu = torch.cuda.is_available() and settings.trainer.accelerator in ("auto", "gpu", "cuda")
+    choice = fastest_precision(use_gpu)
+    settings.trainer.precision = choice.precision
+    why = "" if math.isnan(choice.speedup) else f" (bfloat16 is {choice.speedup:.1f} times as fast as float32 here)"
+    Console(stderr=True).print(f"precision: {choice.precision}{why}", style="dim", highlight=False)
+    return choice.precision
