@@ -283,8 +283,7 @@ class StageCLI(LightningCLI):
             given = f"trainer.max_steps is {self.trainer.max_steps}: give a greater one to train on"
             lines = [f"the checkpoint was trained for {made.steps:,} steps already, and {given}"]
         lines += [f"{name}: {path}" for name, path in saved.items() if path]
-        trainer: Any = self.trainer
-        stops = [callback for callback in trainer.callbacks if isinstance(callback, Convergence)]
+        stops = [one for one in self.trainer.callbacks if isinstance(one, Convergence)]  # type: ignore[attr-defined]
         lines += [remark for callback in stops if (remark := callback.remark())]
         return Report({**saved, "steps": made.steps, "metrics": made.metrics, "logs": made.logs}, lines)
 
