@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from typing import NamedTuple
 
@@ -12,6 +13,8 @@ from rich.console import Console
 from torch import nn
 
 WIDTH, ROWS, REPEATS = 128, 640, 9
+SETTLED = "DDS_PRECISION"
+"""Variable by which the processes of one training agree."""
 WORTH = 1.2
 """How much faster bfloat16 must be to be chosen."""
 
@@ -66,8 +69,11 @@ def settle_precision(settings: Namespace) -> str | None:
     if settings.get("precision") != "auto" or settings.trainer.precision is not None:
         return None
     use_gpu = torch.cuda.is_available() and settings.trainer.accelerator in ("auto", "gpu", "cuda")
+    if "LOCAL_RANK" in os.environ and SETTLED in os.environ:  # the first process, which started this one, has measured
+        settings.trainer.precision = os.environ[SETTLED]
+        return os.environ[SETTLED]
     choice = fastest_precision(use_gpu)
-    settings.trainer.precision = choice.precision
+    settings.trainer.precision = os.environ[SETTLED] = choice.precision
     why = "" if math.isnan(choice.speedup) else f" (bfloat16 is {choice.speedup:.1f} times as fast as float32 here)"
     Console(stderr=True).print(f"precision: {choice.precision}{why}", style="dim", highlight=False)
     return choice.precision

@@ -123,6 +123,25 @@ def test_usage_counts_the_codes_of_all_processes(monkeypatch):
     assert torch.allclose(codebook.usage, before.lerp(torch.tensor([0.25, 0.25, 0.0, 0.5]), 0.02))
 
 
+def test_the_processes_of_a_training_have_one_precision(monkeypatch):
+    from jsonargparse import Namespace
+
+    from dds_lightning.training import precision
+
+    def settled(choice):
+        monkeypatch.setattr(precision, "fastest_precision", lambda gpu: precision.Choice(choice, 2.0))
+        return precision.settle_precision(
+            Namespace(precision="auto", trainer=Namespace(precision=None, accelerator="cpu"))
+        )
+
+    monkeypatch.setenv("DDS_PRECISION", "")
+    monkeypatch.delenv("LOCAL_RANK", raising=False)
+    assert settled("bf16-mixed") == "bf16-mixed"
+    assert settled("32-true") == "32-true"  # another training of the same process measures anew
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    assert settled("bf16-mixed") == "32-true"
+
+
 def dds(*words):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "dds_lightning", *words]
