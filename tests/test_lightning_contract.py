@@ -33,6 +33,7 @@ class Private(NamedTuple):
 CONTRACT = [
     Private(ModelCheckpoint, "_monitor_candidates", "callbacks/best.py", ("trainer",)),
     Private(ModelCheckpoint, "_should_skip_saving_checkpoint", "callbacks/best.py", ("trainer",)),
+    Private(ModelCheckpoint, "_remove_checkpoint", "callbacks/best.py", ("trainer", "filepath")),
     Private(ModelCheckpoint, "_save_topk_checkpoint", "callbacks/best.py", ("trainer", "monitor_candidates")),
     Private(ModelCheckpoint, "_every_n_train_steps", "callbacks/rollouts.py", None),
     Private(LightningCLI, "_parse_ckpt_path", "training/stage_cli.py", ()),

@@ -91,7 +91,7 @@ LINES = [
 LATE = [
     ("--trainer.val_check_interval=5000", "val_check_interval"),
     ("--trainer.callbacks+=EarlyStopping --trainer.callbacks.monitor=val_loss --trainer.max_steps=60", "`val_loss`"),
-    ("--best.monitor=val_loss --trainer.max_steps=60", "`val_loss`"),
+    ("--best.monitor=val_loss --trainer.max_steps=60", "monitor='val_loss'"),
 ]
 """What shows only when the training has begun."""
 
