@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,6 +12,36 @@ from torch import Tensor
 from dds_lightning.errors import UserError
 
 Batch = dict[str, Tensor]
+
+
+def overfits(trainer: Any) -> bool:
+    """Whether a Trainer, if there is one, was asked to train and validate on the same few batches."""
+    return trainer is not None and trainer.overfit_batches > 0
+
+
+def data_state(data: Any) -> dict[str, str]:
+    """What a data module puts into a checkpoint about its `Trajectories`."""
+    return {"name": data.name, "fingerprint": data.fingerprint()}
+
+
+def refuse_other_data(state: Mapping[str, str], data: Any, trainer: Any) -> None:
+    """Refuse a training that goes on with other `Trajectories` than it began with.
+
+    Args:
+        state: As `data_state` returned it.
+        data: The trajectories of now.
+        trainer: Of the data module; None where there is none.
+
+    Raises:
+        UserError: They differ, and the trainer trains.
+    """
+    trains = trainer is None or trainer.state.fn == "fit"
+    if trains and state.get("fingerprint") not in (None, data.fingerprint()):
+        raise UserError(
+            f"data.data: the checkpoint was trained on {state['name']} ({state['fingerprint'][:8]}), these are "
+            f"{data.name} ({data.fingerprint()[:8]}), other data: give the same, or start anew from its weights with "
+            "--model.init_from"
+        )
 
 
 class TensorLoader:

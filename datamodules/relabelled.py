@@ -12,13 +12,14 @@ import lightning.pytorch as pl
 import torch
 from torch import Tensor
 
-from datamodules.loader import TensorLoader
+from datamodules.loader import TensorLoader, data_state, overfits, refuse_other_data
 from datamodules.partial_codes import PartialCodes
 from datamodules.relabel import Relabelled, refuse_other_transitions, relabel, relabel_key
 from datamodules.relabelling import Relabelling
 from datamodules.sources import load_trajectories
 from datamodules.trajectories import Trajectories
-from dds_lightning.errors import UserError
+from dds_lightning.errors import UserError, refuse_seed
+from dds_lightning.saving.files import home
 from dds_lightning.skill import SkillModule
 from dds_lightning.tasks import Task, get_task
 
@@ -66,6 +67,7 @@ class RelabeledDataModule(pl.LightningDataModule):
     ) -> None:
         super().__init__()
         seed = seed or 0
+        refuse_seed("data.seed", seed)
         self.relabelling = Relabelling(**relabelling)
         relabelling.update(self.relabelling.settings())  # defaults included
         self.save_hyperparameters()
@@ -133,7 +135,7 @@ class RelabeledDataModule(pl.LightningDataModule):
         skill = Path(self.hparams.skill)
         if not skill.is_dir():
             return skill.parent
-        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dds-lightning"
+        return Path(os.environ.get("XDG_CACHE_HOME") or home() / ".cache") / "dds-lightning"
 
     def prepare_data(self) -> None:
         """Relabel, unless the result of exactly these inputs is stored."""
@@ -180,6 +182,14 @@ class RelabeledDataModule(pl.LightningDataModule):
             "max_discount": t.discounts[i].max().item(),
         }
 
+    def state_dict(self) -> dict[str, Any]:
+        """Which data these are, for every checkpoint."""
+        return data_state(self.trajectories)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Refuse to go on with other data; `Trainer.validate` and its like may look at any."""
+        refuse_other_data(state_dict, self.trajectories, self.trainer)
+
     def _loader(self, index: Tensor, train: bool = False) -> TensorLoader:
         assert self.transitions is not None, "setup() comes first"
         trainer = self.trainer
@@ -195,7 +205,13 @@ class RelabeledDataModule(pl.LightningDataModule):
         options: dict[str, Any] = {"device": device}
         if train:
             rank, world = (trainer.global_rank, trainer.world_size) if trainer is not None else (0, 1)
-            options |= {"shuffle": True, "seed": h.seed, "drop_last": True, "rank": rank, "world_size": world}
+            options |= {
+                "shuffle": not overfits(trainer),
+                "seed": h.seed,
+                "drop_last": True,
+                "rank": rank,
+                "world_size": world,
+            }
         return TensorLoader(gather, len(index), h.batch_size, **options)
 
     def train_dataloader(self) -> TensorLoader:
@@ -204,6 +220,8 @@ class RelabeledDataModule(pl.LightningDataModule):
 
     def val_dataloader(self) -> TensorLoader | list[Any]:
         """The held-out episodes' transitions in a fixed random order; none when ``validation_fraction`` is 0."""
+        if overfits(self.trainer):
+            return self.train_dataloader()
         return self._loader(self.validation_index) if len(self.validation_index) else []
 
     test_dataloader = val_dataloader

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from datamodules.collect.collectors import can_collect
-from datamodules.loader import Batch, TensorLoader
+from datamodules.loader import Batch, TensorLoader, data_state, overfits, refuse_other_data
 from datamodules.sources import load_trajectories
 from datamodules.trajectories import Trajectories, Windows
-from dds_lightning.errors import UserError
+from dds_lightning.errors import UserError, refuse_seed
 from dds_lightning.nn.normaliser import MIN_STD
 from dds_lightning.tasks import get_task
 
@@ -76,6 +76,7 @@ class SegmentDataModule(pl.LightningDataModule):
             raise UserError(f"max_validation_segments: got {max_validation_segments}, expected at least 1")
         if not 0.0 <= validation_fraction < 1.0:
             raise UserError(f"validation_fraction: got {validation_fraction}, expected 0 to less than 1")
+        refuse_seed("data.seed", seed or 0)
         self.task = get_task(task) if task is not None else None
         self.data, self.horizon, self.stride, self.batch_size = data, horizon, stride, batch_size
         self.validation_fraction, self.seed = validation_fraction, seed or 0
@@ -153,13 +154,16 @@ class SegmentDataModule(pl.LightningDataModule):
         self.setup()
         trainer = self.trainer
         rank, world = (trainer.global_rank, trainer.world_size) if trainer is not None else (0, 1)
+        shuffle = not overfits(trainer)
         return self._loader(
-            self.training_segments, shuffle=True, seed=self.seed, drop_last=True, rank=rank, world_size=world
+            self.training_segments, shuffle=shuffle, seed=self.seed, drop_last=True, rank=rank, world_size=world
         )
 
     def val_dataloader(self) -> TensorLoader | list[Any]:
         """The same segments in the same random order every time; none when `validation_fraction` is 0."""
         self.setup()
+        if overfits(self.trainer):
+            return self.train_dataloader()
         return self._loader(self.validation_segments) if len(self.validation_segments) else []
 
     def test_dataloader(self) -> TensorLoader | list[Any]:
@@ -171,6 +175,14 @@ class SegmentDataModule(pl.LightningDataModule):
         self.setup()
         assert self._windows is not None
         return self._loader(np.arange(len(self._windows)))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Which data these are, for every checkpoint."""
+        return data_state(self._loaded())
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Refuse to go on with other data; `Trainer.validate` and its like may look at any."""
+        refuse_other_data(state_dict, self._loaded(), self.trainer)
 
     # ------------------------------------------------------------------ helpers
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from datamodules.validation import DataError
 from dds_lightning.errors import UserError
 from dds_lightning.saving.arrays import read_npy
-from dds_lightning.saving.files import folder_written_whole, mend_folder, refuse_newer
+from dds_lightning.saving.files import expand, folder_written_whole, mend_folder, refuse_newer
 from dds_lightning.saving.untrusted import mapping, read_json, safe_name
 
 FORMAT = 1
@@ -58,7 +58,7 @@ def read_arrays(
         DataError: When a file is missing, damaged or of another type.
         UserError: When a newer version of this package wrote them.
     """
-    folder = Path(directory).expanduser()
+    folder = expand(directory)
     with contextlib.suppress(OSError):
         mend_folder(folder)
     try:

@@ -13,13 +13,14 @@ import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from dds_lightning._moved import redirect_old_paths
+from dds_lightning._moved import redirect_old_paths, use_our_datamodules
 from dds_lightning._version import __version__ as __version__
 
 # Threads that wait for each other must not spin: with one other busy process on two cores a training step took 12 times
 # as long (2,000 ms instead of 160). Read when torch is first imported; whoever sets it otherwise is heard.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 redirect_old_paths()
+use_our_datamodules()
 
 if TYPE_CHECKING:
     from dds_lightning.agent import DDSAgent as DDSAgent

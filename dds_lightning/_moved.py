@@ -1,4 +1,4 @@
-"""Import paths of earlier versions: each still gives the module that now holds what it held."""
+"""Imports that need help: paths of earlier versions, and a foreign package with the name of one of ours."""
 
 import sys
 import warnings
@@ -6,8 +6,13 @@ from collections.abc import Sequence
 from importlib import import_module
 from importlib.abc import InspectLoader, Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
-from importlib.util import find_spec
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from pathlib import Path
 from types import CodeType, ModuleType
+
+NAME = "datamodules"
+"""Our second package; projects made from Lightning's templates have one of that name too."""
+OURS = Path(__file__).parents[1] / NAME
 
 _DRAW = (
     *("bars", "charts", "clip", "curves", "dataset", "drawing", "gif"),
@@ -84,3 +89,28 @@ def redirect_old_paths() -> None:
     """Let the old paths be imported; harmless when repeated."""
     if not any(isinstance(finder, _Redirect) for finder in sys.meta_path):
         sys.meta_path.append(_Redirect())
+
+
+def use_our_datamodules() -> None:
+    """Let `import datamodules` mean ours; what ours does not have is looked for in the other one.
+
+    Raises:
+        ImportError: The other one has been imported already.
+    """
+    loaded = sys.modules.get(NAME)
+    if loaded is not None:
+        if OURS in [Path(place) for place in getattr(loaded, "__path__", ())]:
+            return
+        raise ImportError(
+            f"{next(iter(getattr(loaded, '__path__', ())), NAME)} is another package called {NAME} than the one that "
+            "dds_lightning brings, and was imported first: import dds_lightning before it, or rename it"
+        )
+    found = find_spec(NAME)
+    others = [place for place in (found.submodule_search_locations or () if found else ()) if Path(place) != OURS]
+    if found is not None and not others:
+        return
+    spec = spec_from_file_location(NAME, OURS / "__init__.py", submodule_search_locations=[str(OURS), *others])
+    assert spec is not None, "a file has a specification"
+    assert spec.loader is not None, "a source file has a loader"
+    sys.modules[NAME] = module = module_from_spec(spec)
+    spec.loader.exec_module(module)

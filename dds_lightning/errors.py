@@ -6,6 +6,8 @@ import unicodedata
 OUT_OF_MEMORY = ("out of memory", "can't allocate memory", "not enough memory", "ALLOC_FAILED")
 """What accelerators, the allocators of torch on Linux and Windows, and cuBLAS say."""
 
+GREATEST_SEED = 2**32 - 1
+
 
 LONGEST = 1100
 """Characters of a message; of a longer one, which quotes something without end, beginning and end are kept."""
@@ -46,6 +48,24 @@ def lacks_extra(what: str, extra: str) -> UserError:
         extra: The extra of this project that brings it.
     """
     return UserError(f"{what}: run `pip install -e '.[{extra}]' -c constraints.txt` in this project's checkout")
+
+
+class ToldAlreadyError(UserError):
+    """A user's mistake that another process, started for this one, has told; the exit status is 2 all the same."""
+
+
+def refuse_seed(name: str, seed: int) -> None:
+    """Refuse a seed that one of the libraries would not take.
+
+    Args:
+        name: Of the setting.
+        seed: Its value.
+
+    Raises:
+        UserError: It is negative or has more than 32 bits, which is NumPy's limit.
+    """
+    if not 0 <= seed <= GREATEST_SEED:
+        raise UserError(f"{name} is {seed}, expected a whole number from 0 to {GREATEST_SEED}")
 
 
 def is_out_of_memory(error: BaseException) -> bool:

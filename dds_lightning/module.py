@@ -168,6 +168,14 @@ class StageModule(pl.LightningModule):
         self.normaliser.fit(mean, std)
         self.action_box.fit(low, high)
 
+    def agree(self, part: nn.Module, more: Any = None) -> Any:
+        """Give every process of a distributed training the first one's `part`, and what it says beside it."""
+        if self.trainer.world_size == 1:
+            return more
+        state, more = self.trainer.strategy.broadcast((part.state_dict(), more))
+        part.load_state_dict(state)
+        return more
+
     def log_training(self, total: Tensor, more: Callable[[], Mapping[str, Tensor]] = dict) -> None:
         """Log a training step's loss and terms, at the steps of `is_log_step`.
 
@@ -275,4 +283,4 @@ def adam(
 def is_log_step(module: pl.LightningModule) -> bool:
     """Whether this step is logged: `log_dict` at every step of a small network costs as much as the step."""
     every = getattr(module.trainer, "log_every_n_steps", 50)
-    return module.global_step % max(every, 1) == 0
+    return every > 0 and module.global_step % every == 0

@@ -342,7 +342,7 @@ class PolicyModule(StageModule):
         log_pi = self.logits(batch["observations"]).log_softmax(dim=-1)
         info["code_accuracy"] = (log_pi.argmax(dim=-1) == batch["codes"]).float().mean()
         info["entropy"] = -torch.special.xlogy(log_pi.exp(), log_pi.exp()).sum(dim=-1).mean()
-        self.log_dict({f"{stage}/{k}": x for k, x in info.items()}, batch_size=len(batch["codes"]))
+        self.log_dict({f"{stage}/{k}": x for k, x in info.items()}, batch_size=len(batch["codes"]), sync_dist=True)
 
     def predict_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """Greedy codes (B,) for the states of a batch."""

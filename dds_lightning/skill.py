@@ -258,10 +258,13 @@ class SkillModule(StageModule):
         def first() -> Tensor:
             # A separate loader: reading data here must not move the training's position.
             datamodule: Any = getattr(self.trainer, "datamodule", None)
+            if datamodule is None:
+                self.trainer.fit_loop.setup_data()  # Lightning would make the loaders after this
             loader: Any = datamodule.train_dataloader() if datamodule else self.trainer.train_dataloader
             return self._encodings_of(islice(iter(loader), START_BATCHES))
 
         self.bottleneck.start(first)
+        self.agree(self.bottleneck)
 
     @torch.no_grad()
     def _encodings_of(self, batches: Iterable[Batch]) -> Tensor:
@@ -292,7 +295,7 @@ class SkillModule(StageModule):
         generator = torch.Generator().manual_seed(step)
         moved = self.bottleneck.revive(lambda: self._encodings_of([self._batch]), h.restart_threshold, generator)
         optimizer: Any = self.optimizers()
-        for parameter, rows in moved.items():
+        for parameter, rows in zip(moved, self.agree(self.bottleneck, list(moved.values())), strict=True):
             state = optimizer.state.get(parameter, {})
             for name in ("exp_avg", "exp_avg_sq"):  # the moments belonged to the code that died
                 if name in state:
@@ -307,7 +310,7 @@ class SkillModule(StageModule):
         sampled = self.decode_vectors(observations.flatten(0, 1), vectors, noise_scale=1.0)
         self.reconstruction_rmse.update((sampled - actions.flatten(0, 1)).square().mean(dim=-1))
         log = {f"{stage}/{name}": value for name, value in {"loss": total, **terms}.items()}
-        self.log_dict(log, batch_size=len(actions))
+        self.log_dict(log, batch_size=len(actions), sync_dist=True)
         if skill.codes is not None:
             self.usage.update(skill.codes)
 
@@ -330,7 +333,7 @@ class SkillModule(StageModule):
         log = {"reconstruction_rmse": self.reconstruction_rmse.compute().sqrt()}
         if self.discrete:
             log.update(self.usage.compute())
-        self.log_dict({f"{stage}/{name}": value for name, value in log.items()}, prog_bar=True)
+        self.log_dict({f"{stage}/{name}": value for name, value in log.items()}, prog_bar=True, sync_dist=True)
 
     def on_fit_end(self) -> None:
         """Warn where most of the codebook is idle."""

@@ -55,7 +55,8 @@ ROOMS = {
     "datamodules.trajectories",
     "datamodules.segments": "errors nn tasks datamodules.collect datamodules.loader datamodules.sources "
     "datamodules.trajectories",
-    "datamodules.relabelled": "errors skill tasks datamodules.loader datamodules.partial_codes datamodules.relabel "
+    "datamodules.relabelled": "errors saving skill tasks datamodules.loader datamodules.partial_codes "
+    "datamodules.relabel "
     "datamodules.relabelling datamodules.sources datamodules.trajectories",
     # training
     "dds_lightning.callbacks": "agent console envs errors policy rollout skill tasks",

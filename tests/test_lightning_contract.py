@@ -15,6 +15,7 @@ import torch
 from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint, ProgressBar
 from lightning.pytorch.cli import LightningCLI
 from lightning.pytorch.plugins.io import TorchCheckpointIO
+from lightning.pytorch.strategies import DDPStrategy
 
 ROOT = Path(__file__).parents[1]
 
@@ -32,6 +33,7 @@ class Private(NamedTuple):
 CONTRACT = [
     Private(ModelCheckpoint, "_monitor_candidates", "callbacks/best.py", ("trainer",)),
     Private(ModelCheckpoint, "_should_skip_saving_checkpoint", "callbacks/best.py", ("trainer",)),
+    Private(ModelCheckpoint, "_remove_checkpoint", "callbacks/best.py", ("trainer", "filepath")),
     Private(ModelCheckpoint, "_save_topk_checkpoint", "callbacks/best.py", ("trainer", "monitor_candidates")),
     Private(ModelCheckpoint, "_every_n_train_steps", "callbacks/rollouts.py", None),
     Private(LightningCLI, "_parse_ckpt_path", "training/stage_cli.py", ()),
@@ -40,6 +42,7 @@ CONTRACT = [
     Private(LightningCLI, "_instantiate_trainer", "training/stage_cli.py", ("config", "callbacks")),
     Private(LightningCLI, "_run_subcommand", "training/stage_cli.py", ("subcommand",)),
     Private(LightningCLI, "_prepare_subcommand_kwargs", "training/stage_cli.py", ("subcommand",)),
+    Private(DDPStrategy, "_ddp_kwargs", "training/stage_cli.py", None),
     Private(torch, "_assert_async", "callbacks/guard.py", None),
     Private(torch, "_foreach_lerp_", "policy.py", None),
 ]

@@ -85,3 +85,16 @@ def test_a_robot_of_ones_own_gets_from_arrays_to_a_score_as_shown(capsys):
     assert main(["publish", "runs/reacher", "agent"]) == 0
     assert main(["evaluate", "agent", "--episodes=1", "--workers=0", "--json"]) == 0
     assert '"task": "reacher"' in capsys.readouterr().out
+
+
+def test_scripts_of_ones_own_train_as_shown():
+    """The plain Trainer, with our data modules and with a loader of one's own; a few steps on a few data."""
+    task = "pointmaze-large-diverse"
+    assert main(["data", "collect", task, "--steps=1000", "--workers=1", "--out=data"]) == 0
+    blocks = [block for block in PYTHON if "L.Trainer(" in block]
+    assert len(blocks) == 2
+    for block in blocks:
+        code = re.sub(r"max_steps=[\d_]+", "max_steps=2, accelerator='cpu', logger=False, limit_val_batches=1", block)
+        names: dict = {}
+        exec(compile(code, "README.md", "exec"), names)
+        assert bool(names["skill"].bottleneck.initted)

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from datamodules.validation import DataError
 from dds_lightning.errors import UserError
 from dds_lightning.saving.arrays import read_tensors
-from dds_lightning.saving.files import written_whole
+from dds_lightning.saving.files import expand, written_whole
 from dds_lightning.saving.untrusted import mapping, parse_json
 
 FORMAT = "1"
@@ -103,7 +103,7 @@ class MLPPolicy:
         Raises:
             DataError: The file is missing, damaged or not a behaviour policy.
         """
-        path = Path(path).expanduser()
+        path = expand(path)
         try:
             arrays, header = read_tensors(path, "numpy")
             metadata = mapping(parse_json(header.get("metadata", "{}"), path), path)

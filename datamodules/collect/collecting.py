@@ -14,7 +14,7 @@ from gymnasium.envs.registration import EnvSpec
 from datamodules.collect.minari_writer import write_minari
 from datamodules.collect.recording import Episode, EpisodeRecorder, PartialRecording, record
 from datamodules.storage import refuse_existing
-from dds_lightning.errors import UserError
+from dds_lightning.errors import UserError, refuse_seed
 from dds_lightning.tasks import Task, get_task
 
 
@@ -156,8 +156,7 @@ def prepare_folder(task: Task, steps: int, seed: int, out: str | Path, dataset_i
     """
     if steps < 1:
         raise UserError(f"steps: got {steps}, expected at least 1")
-    if seed < 0:
-        raise UserError(f"seed: got {seed}, expected at least 0")
+    refuse_seed("seed", seed)
     folder = Path(out) / (dataset_id or task.data_ids["local"])
     refuse_existing(folder, overwrite)
     return folder

@@ -13,9 +13,10 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from dds_lightning.envs.physics import mujoco
 
 Vector = NDArray[np.float64]
 

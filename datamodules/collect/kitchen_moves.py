@@ -15,12 +15,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from datamodules.collect.franka import CLOSED, OPEN, Aim, FrankaArm, Vector
 from dds_lightning.envs.kitchen import subtasks_done
+from dds_lightning.envs.physics import mujoco
 
 Triple = tuple[float, float, float]
 HALF_OPEN = 0.018

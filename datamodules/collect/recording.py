@@ -174,7 +174,8 @@ _recorder: EpisodeRecorder | None = None
 
 def _set_recorder(recorder: EpisodeRecorder) -> None:
     global _recorder
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
+    for signum in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(signum, signal.SIG_IGN)  # the parent decides
     _recorder = recorder
 
 

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import mujoco
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
@@ -28,6 +27,7 @@ from datamodules.physics.resimulate import blur, simulate
 from datamodules.physics.states import RecordedSteps, draw_steps
 from datamodules.sources import resolve_task
 from datamodules.validation import DataError
+from dds_lightning.envs.physics import mujoco
 from dds_lightning.tasks import Task
 from dds_lightning.tasks.bodies import body_of
 from dds_lightning.tasks.env import open_env

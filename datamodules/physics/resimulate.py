@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.physics.states import RecordedSteps
+from dds_lightning.envs.physics import mujoco
 
 KITCHEN_NOISE = ((0.01, 0.0005), (0.1, 0.1))
 """Noise on (robot, objects) as shares of the kitchen's amplitudes: FrankaKitchen-v1's, and D4RL's."""

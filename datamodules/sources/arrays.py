@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from datamodules.sources.plausibility import refuse_other_task
 from datamodules.sources.source import Recording, Source, check_width
 from datamodules.trajectories import Trajectories
 from datamodules.validation import SLICE, in_box
+from dds_lightning.saving.files import expand
 from dds_lightning.tasks import Task
 
 
@@ -63,7 +63,7 @@ ARRAYS = Source(
     rest="DIR",
     about="a folder that `Trajectories.save` wrote",
     load=load_arrays,
-    locate=lambda directory: Path(directory).expanduser(),
+    locate=lambda directory: expand(directory),
     open_rows=open_arrays,
     again="write the folder again with `Trajectories.save`",
 )

@@ -9,7 +9,7 @@ from urllib.parse import quote
 from datamodules.sources.download import download
 from datamodules.validation import DataError
 from dds_lightning.errors import UserError
-from dds_lightning.saving.files import neighbours
+from dds_lightning.saving.files import expand, home, neighbours
 from dds_lightning.saving.untrusted import remove_tree
 from dds_lightning.tasks import Task, get_task, task_names
 from dds_lightning.tasks.bodies import body_of
@@ -55,7 +55,7 @@ def fetch_d4rl(task: Task, folder: str | Path | None = None) -> Path:
     """
     name = _published(task, "d4rl")
     url = f"{D4RL_SERVER}/{_d4rl(task)[0]}/{quote(name)}"
-    return download(url, Path(folder or d4rl_root()).expanduser() / name)
+    return download(url, expand(folder or d4rl_root()) / name)
 
 
 def fetch_minari(dataset_id: str, root: str | Path | None = None) -> Path:
@@ -74,7 +74,7 @@ def fetch_minari(dataset_id: str, root: str | Path | None = None) -> Path:
     """
     from datamodules.sources.minari import check_minari_id, minari_root, read_metadata
 
-    folder = Path(root or minari_root()).expanduser() / check_minari_id(dataset_id)
+    folder = expand(root or minari_root()) / check_minari_id(dataset_id)
     if folder.exists():
         return folder
     repository, _, inner = dataset_id.partition("/")
@@ -103,7 +103,7 @@ def _published(task: Task, source: str) -> str:
 
 def d4rl_root() -> Path:
     """Where D4RL keeps its files: D4RL_DATASET_DIR, else ~/.d4rl/datasets."""
-    return Path(os.environ.get("D4RL_DATASET_DIR") or Path.home() / ".d4rl" / "datasets")
+    return Path(os.environ.get("D4RL_DATASET_DIR") or home() / ".d4rl" / "datasets")
 
 
 def find_d4rl(name: str) -> Path:
@@ -116,7 +116,7 @@ def find_d4rl(name: str) -> Path:
     Raises:
         DataError: When there is no such file; the message says how to get it.
     """
-    path = Path(name).expanduser()
+    path = expand(name)
     if path.exists():
         return path
     if len(path.parts) > 1:

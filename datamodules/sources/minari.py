@@ -25,7 +25,7 @@ from datamodules.sources.source import Recording, Source
 from datamodules.trajectories import Trajectories
 from datamodules.validation import FIELDS, DataError, validate_episode
 from dds_lightning.errors import UserError
-from dds_lightning.saving.files import mend_folder
+from dds_lightning.saving.files import expand, home, mend_folder
 from dds_lightning.tasks import Task
 from dds_lightning.tasks.bodies import Part
 
@@ -67,7 +67,7 @@ def minari_folder(dataset_id: str) -> Path:
 
 def minari_root() -> Path:
     """Where Minari keeps its data sets: MINARI_DATASETS_PATH, else ~/.minari/datasets."""
-    return Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets")
+    return Path(os.environ.get("MINARI_DATASETS_PATH") or home() / ".minari" / "datasets")
 
 
 def load_local(directory: str | Path, task: Task | None) -> Trajectories:
@@ -94,7 +94,7 @@ def load_local(directory: str | Path, task: Task | None) -> Trajectories:
 
 def data_folder(directory: str | Path) -> Path:
     """The folder with `main_data.hdf5` and `metadata.json`: `data` in a data set's folder, or that folder itself."""
-    folder = Path(directory).expanduser()
+    folder = expand(directory)
     with contextlib.suppress(OSError):
         mend_folder(folder)
     return folder / "data" if (folder / "data").is_dir() else folder
@@ -316,7 +316,7 @@ LOCAL = Source(
     rest="DIR",
     about="a folder with a Minari data set",
     load=load_local,
-    locate=lambda directory: Path(directory).expanduser(),
+    locate=lambda directory: expand(directory),
     open_rows=open_local,
     again="collect or download the data set again",
     recorded_in=local_env_id,

@@ -97,7 +97,8 @@ class BehaviourCloning(StageModule):
 
     def evaluate(self, batch: dict[str, Tensor], stage: str) -> None:
         """Log the same loss on held-out episodes."""
-        self.log(f"{stage}/loss", self.loss(batch), prog_bar=stage == "val", batch_size=len(batch["actions"]))
+        loss = self.loss(batch)
+        self.log(f"{stage}/loss", loss, prog_bar=stage == "val", batch_size=len(batch["actions"]), sync_dist=True)
 
     def predict_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """Return actions (B H, A) for the steps of a batch."""

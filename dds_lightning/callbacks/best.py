@@ -1,5 +1,6 @@
 """The checkpoint with the best value of a metric."""
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -77,3 +78,13 @@ class BestCheckpoint(ModelCheckpoint):
         candidates = self._monitor_candidates(trainer)
         if self.monitor in candidates and not self._should_skip_saving_checkpoint(trainer):
             self._save_topk_checkpoint(trainer, candidates)
+
+    def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Say so where the metric was never logged: a name that is mistyped, or no validation."""
+        super().on_train_end(trainer, pl_module)
+        if not self.best_model_path and self.monitor not in trainer.callback_metrics:
+            logged = ", ".join(sorted(trainer.callback_metrics)) or "nothing"
+            warnings.warn(
+                f"best.monitor is {self.monitor}, which was not logged ({logged} was): there is no best checkpoint",
+                stacklevel=2,
+            )

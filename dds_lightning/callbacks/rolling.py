@@ -4,6 +4,7 @@ Lightning's `ModelCheckpoint` does not serve here: it does not save when a signa
 before a validation of the same step, resuming leaves that validation out.
 """
 
+import multiprocessing
 import time
 from pathlib import Path
 from typing import Any
@@ -45,12 +46,19 @@ class RollingCheckpoint(Checkpoint):
     def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
         """Decide where the file goes."""
         if stage == "fit":
-            folder = self.dirpath or str(Path(trainer.log_dir or trainer.default_root_dir) / "checkpoints")
-            self.path = Path(trainer.strategy.broadcast(folder)) / "last.ckpt"
+            self.path = Path(trainer.strategy.broadcast(str(self.place(trainer))))
+            self.path.parent.mkdir(parents=True, exist_ok=True)  # a place that cannot be written shows before training
+
+    def place(self, trainer: pl.Trainer) -> Path:
+        """Where the file of this launch goes."""
+        folder = self.dirpath or Path(trainer.log_dir or trainer.default_root_dir) / "checkpoints"
+        return Path(folder) / "last.ckpt"
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Count the seconds from here: nothing before can be lost."""
         # Lightning's SIGTERM handler would end the program between two steps without saving.
+        if multiprocessing.parent_process() is not None:
+            interrupts.catch_in_a_process()
         interrupts.take_back()
         self._saved_time = time.monotonic()
         self._saved_step = trainer.global_step

@@ -12,7 +12,7 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from dds_lightning.agent import AgentSelection, DDSAgent
 from dds_lightning.callbacks.resume import undisturbed
 from dds_lightning.envs.pool import EnvPool
-from dds_lightning.errors import UserError
+from dds_lightning.errors import UserError, refuse_seed
 from dds_lightning.policy import PolicyModule
 from dds_lightning.rollout.actors import Contestant, single_skills
 from dds_lightning.rollout.play import rollout
@@ -87,6 +87,7 @@ class RolloutEvaluation(Callback):
         ):
             if value < least:
                 raise UserError(f"rollout evaluation: {name} is {value}, expected {least} or more")
+        refuse_seed("rollout evaluation: seed", seed)
         if not selections:
             raise UserError("rollout evaluation: selections is empty, expected for example [sample]")
         self.task: Task | None = get_task(task) if task else None
@@ -101,6 +102,12 @@ class RolloutEvaluation(Callback):
         self._evaluated_step = 0
         self._pool: EnvPool | None = None
         self._skill: SkillModule | None = None
+
+    RECORDS = False
+    """Whether the paths of the episodes are kept for `show`."""
+
+    def show(self, trainer: pl.Trainer, result: RolloutResult) -> None:
+        """Show what was played; called on the first process after each evaluation, for a subclass to use."""
 
     # ---------------------------------------------------------------- when
 
@@ -195,8 +202,11 @@ class RolloutEvaluation(Callback):
         players = self.contestants(trainer, pl_module)
         if self._pool is None or self._pool.closed:
             self._pool = EnvPool(self.task, slots_needed(players, self.slots), self.workers)
-        result = rollout(self.task, players, seed=self.seed, slots=self.slots, progress=False, pool=self._pool)
+        result = rollout(
+            self.task, players, seed=self.seed, slots=self.slots, progress=False, pool=self._pool, record=self.RECORDS
+        )
         self.last = result
+        self.show(trainer, result)
         measured = [*(["success"] if self.task.measures_success else []), "score"]
         values: dict[str, float] = {}
         for rank, row in enumerate(result.summary().to_dict("records")):

@@ -5,6 +5,8 @@ for each training stage, is Lightning's command line (`training.stage_cli`). Wha
 text for people or, with `--json`, as a single JSON document on standard output; progress and logs go to standard error.
 """
 
+import errno
+import re
 import shlex
 import sys
 import warnings
@@ -14,8 +16,8 @@ from typing import Any
 
 from dds_lightning._version import __version__
 from dds_lightning.console.interrupts import Interrupted, caught
-from dds_lightning.errors import UserError, is_out_of_memory, printable, reason
-from dds_lightning.saving.files import DISK_ERRORS
+from dds_lightning.errors import ToldAlreadyError, UserError, is_out_of_memory, printable, reason
+from dds_lightning.saving.files import DISK_ERRORS, expand
 from dds_lightning.training.stages import STAGES
 
 USAGE_ERROR = 2
@@ -33,7 +35,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with caught(), warnings.catch_warnings():
             warnings.showwarning = _warn
-            return _dispatch(arguments)
+            return _dispatch([_at_home(argument) for argument in arguments])
+    except ToldAlreadyError:
+        return USAGE_ERROR
     except UserError as error:
         return _complain(str(error))
     except (MemoryError, RuntimeError) as error:
@@ -48,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout = None
         return 0
     except OSError as error:
-        if error.errno not in DISK_ERRORS:
+        if error.errno not in (*DISK_ERRORS, errno.ENOENT):
             raise
         return _complain(f"{error.filename}: {error.strerror}" if error.filename else str(error.strerror))
 
@@ -61,18 +65,30 @@ def _dispatch(arguments: list[str]) -> int:
         return 0
     try:
         if arguments and arguments[0] in STAGES:
+            from dds_lightning.training.options import help_of, refuse_typos
+
+            if (text := help_of(arguments[0], arguments[1:])) is not None:
+                print(text, end="")
+                return 0
+            refuse_typos(arguments[0], arguments[1:])
             from dds_lightning.training.stage_cli import command
 
             as_json, work = "--json" in arguments, command(arguments[0], arguments[1:])
         else:
             as_json, work = _command(arguments)
     except ArgumentError as error:
-        return _complain(f"{error.message} (see `{shlex.join(['dds', *_path(arguments)])} --help`)")
+        return _complain(_mistyped(_path(arguments), error.message))
     except SystemExit as stop:  # how --help and --print_config end
         if isinstance(stop, Interrupted):
             raise
         return int(stop.code or 0)
     return _report(work, as_json)
+
+
+def _at_home(argument: str) -> str:
+    """Expand `~` where a shell leaves it: after `--out=`, and after `local:`."""
+    found = re.fullmatch(r"((?:--[\w.]+\+?=)?(?:(?:local|d4rl|arrays|minari):)?)(~(?:/.*)?)", argument)
+    return f"{found[1]}{expand(found[2])}" if found else argument
 
 
 def _path(arguments: list[str]) -> list[str]:
@@ -89,9 +105,24 @@ def _path(arguments: list[str]) -> list[str]:
     return path
 
 
+def _mistyped(path: list[str], message: str) -> str:
+    """What the parser refused, with what may have been meant and where the help is."""
+    from dds_lightning.cli.parser import options_of
+    from dds_lightning.console.refusals import did_you_mean, sentence
+
+    told = sentence(message)
+    known = options_of(path)
+    if (found := re.search(r"unrecognized arguments: (--[\w.-]+)", told)) is not None:
+        told = f"{found[1]} is not an option of `{shlex.join(['dds', *path])}`"
+        told += did_you_mean(found[1].partition(".")[0], [f"--{one}" for one in known])
+    elif (found := re.search(r"invalid choice: '?([^' ]+)", told)) is not None:
+        told += did_you_mean(found[1], known)
+    return f"{told} (see `{shlex.join(['dds', *path])} --help`)"
+
+
 def _command(arguments: list[str]) -> tuple[bool, Callable[[], Any]]:
     """Parse the arguments of one of the commands defined here."""
-    from dds_lightning.cli.parser import build_parser, prepare
+    from dds_lightning.cli.parser import build_parser, prepare, refuse_settings
 
     parser, functions = build_parser()
     config = parser.parse_args(prepare(arguments or ["--help"]))
@@ -101,6 +132,7 @@ def _command(arguments: list[str]) -> tuple[bool, Callable[[], Any]]:
         inner = settings.pop("subcommand")
         name, settings = f"{name} {inner}", settings.pop(inner)
     settings.pop("config", None)
+    refuse_settings(settings)
     as_json = settings.pop("json", False)
     return as_json, lambda: functions[name](**settings.as_dict())
 

@@ -1,8 +1,7 @@
 """Arguments that several commands share, and how they are read."""
 
-from pathlib import Path
-
 from dds_lightning.errors import UserError
+from dds_lightning.saving.files import expand
 
 
 def data_spec(data: str) -> str:
@@ -14,7 +13,7 @@ def data_spec(data: str) -> str:
     Raises:
         UserError: There is no source and no such path.
     """
-    path = Path(data).expanduser()
+    path = expand(data)
     if path.is_dir():
         return f"{'arrays' if (path / 'trajectories.json').is_file() else 'local'}:{data}"
     if path.suffix in (".hdf5", ".h5") and path.is_file():

@@ -1,15 +1,18 @@
 """From functions to a command line."""
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+import typing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Literal
 
 import docstring_parser
 from jsonargparse import ArgumentParser
 
 from dds_lightning.cli import atlas, checkpoints, commands, data, record
+from dds_lightning.cli.completion import script
 from dds_lightning.console.arguments import as_lists, list_options
-from dds_lightning.errors import UserError
+from dds_lightning.console.reports import Report
+from dds_lightning.errors import UserError, refuse_seed
 from dds_lightning.training.stages import STAGES
 
 Commands = Mapping[str, Any]  # name -> function, a group of commands, or None for one of Lightning's
@@ -50,6 +53,7 @@ def command_table() -> Commands:
         "publish": checkpoints.publish,
         "checkpoints": {"list": checkpoints.list_, "verify": checkpoints.verify},
         "export": checkpoints.export,
+        "completion": completion,
     }
 
 
@@ -140,3 +144,69 @@ def prepare(arguments: list[str]) -> list[str]:
         else:
             out.append(f"{argument}=true" if argument in flags else argument)
     return out
+
+
+def options_of(path: Sequence[str]) -> list[str]:
+    """What may follow the words of a command: further words, or the options of the function that it is."""
+    entry: Any = command_table()
+    for word in path:
+        entry = entry[word]
+    if isinstance(entry, Mapping):
+        return list(entry)
+    stages = list(STAGES) if entry in TAKES_STAGES else []
+    return ["json", *(inspect.signature(entry).parameters if entry else ()), *stages]
+
+
+def refuse_settings(settings: Mapping[str, Any]) -> None:
+    """Refuse settings whose mistakes show without doing anything: seeds, and the arguments of training stages.
+
+    Raises:
+        UserError: Names the first.
+    """
+    if settings.get("seed") is not None:
+        refuse_seed("--seed", settings["seed"])
+    for stage in STAGES:
+        if settings.get(stage):
+            from dds_lightning.training.options import refuse_typos
+
+            refuse_typos(stage, ["fit", *settings[stage]], prefix=f"{stage}.")
+
+
+def completion(shell: Literal["bash", "zsh"]) -> Report:
+    """Print what lets a shell complete commands and options: add `eval "$(dds completion bash)"` to ~/.bashrc.
+
+    Args:
+        shell: The shell; for zsh the line goes into ~/.zshrc.
+    """
+    text = script({" ".join(path): known for path, known in _words()}, zsh=shell == "zsh")
+    return Report({"shell": shell, "script": text}, [text])
+
+
+def _words() -> Iterator[tuple[tuple[str, ...], list[str]]]:
+    """The words of every command, and what may follow them."""
+    from dds_lightning.training.options import SUBCOMMANDS, options
+
+    table = command_table()
+    yield (), [*table, "--help", "--version"]
+    for name, entry in table.items():
+        if isinstance(entry, Mapping):
+            yield (name,), [*entry, "--help"]
+            for inner in entry:
+                yield (name, inner), _flags(entry[inner], options_of([name, inner]))
+        elif entry is None:
+            yield (name,), [*SUBCOMMANDS, "--help"]
+            for subcommand in SUBCOMMANDS:
+                yield (name, subcommand), [*(f"--{one}=" for one in options(STAGES[name])), "--help"]
+        else:
+            stages = (
+                [f"--{stage}.{one}=" for stage in STAGES for one in options(STAGES[stage])] if name == "run" else []
+            )
+            yield (name,), [*_flags(entry, options_of([name])), *stages]
+
+
+def _flags(function: Any, names: list[str]) -> list[str]:
+    """Options of a command, with the values of those that take one of a few."""
+    hints = typing.get_type_hints(function)
+    choices = {name: typing.get_args(hint) for name, hint in hints.items() if typing.get_origin(hint) is Literal}
+    listed = [f"--{name}={value}" for name in names for value in choices.get(name, ())]
+    return [*(f"--{name}" for name in names if name not in choices), *listed, "--help"]

@@ -2,16 +2,19 @@
 
 Outside a training the first signal raises `Interrupted` at once. Inside `deferred()` it only sets a mark,
 which the checkpoint callback sees after the next optimiser step: it saves and raises there. A second signal
-is never deferred.
+is never deferred, unless it comes with the first: a terminal signals a whole group, and a parent passes it on.
 """
 
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+TOGETHER = 1.0
+"""Seconds within which two signals are one request."""
 
 
 class Interrupted(SystemExit):
@@ -32,6 +35,7 @@ class _Mark:
     catching = False
     deferring = False
     signum: int | None = None
+    since = 0.0
 
 
 def pending() -> int | None:
@@ -41,7 +45,9 @@ def pending() -> int | None:
 
 def _on_signal(signum: int, frame: FrameType | None) -> None:
     if _Mark.deferring and _Mark.signum is None:
-        _Mark.signum = signum
+        _Mark.signum, _Mark.since = signum, time.monotonic()
+        return
+    if _Mark.deferring and time.monotonic() - _Mark.since < TOGETHER:
         return
     _Mark.signum = None
     raise Interrupted(signum)
@@ -61,6 +67,12 @@ def caught() -> Iterator[None]:
         _Mark.catching = False
         for signum, handler in before.items():
             signal.signal(signum, handler)
+
+
+def catch_in_a_process() -> None:
+    """In a process that a training has started, which entered no block of `caught()`: defer signals until its end."""
+    if not _Mark.catching and threading.current_thread() is threading.main_thread():
+        _Mark.catching = _Mark.deferring = True
 
 
 def take_back() -> None:

@@ -24,14 +24,18 @@ class Report:
         data: What `--json` prints: anything made of dicts, lists, numbers, strings, arrays and tables.
         text: What a person reads: lines and rich tables.
         status: Exit status of the command.
+        silent: Print nothing: another process of the same training does.
     """
 
     data: Any
     text: list["RenderableType"] = field(default_factory=list)
     status: int = 0
+    silent: bool = False
 
     def print(self, as_json: bool) -> None:
         """Print the data or the text to standard output."""
+        if self.silent:
+            return
         if as_json:
             print(json.dumps(plain(self.data), indent=2, allow_nan=False))
             return

@@ -18,13 +18,13 @@ from __future__ import annotations
 import xml.etree.ElementTree as ElementTree
 from typing import Any, ClassVar
 
-import mujoco
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.mujoco import MujocoEnv
 from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
+from dds_lightning.envs.physics import mujoco
 from dds_lightning.errors import UserError
 
 TIMESTEP = 0.02

@@ -7,6 +7,7 @@ import io
 import tempfile
 import threading
 import warnings
+from importlib import import_module
 from typing import Any
 
 import gymnasium as gym
@@ -20,6 +21,7 @@ _BUILD_LOCK = threading.Lock()
 def register_environments() -> None:
     """Register gymnasium-robotics' environments and ours with Gymnasium; slow the first time, so done late."""
     with _BUILD_LOCK, contextlib.redirect_stderr(io.StringIO()):  # it prints a notice on others
+        import_module("dds_lightning.envs.physics")  # before Gymnasium imports MuJoCo, which would need graphics
         import gymnasium_robotics
 
         gym.register_envs(gymnasium_robotics)

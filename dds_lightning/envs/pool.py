@@ -19,6 +19,7 @@ from __future__ import annotations
 import contextlib
 import os
 import pickle
+import signal
 import subprocess
 import sys
 import weakref
@@ -75,6 +76,7 @@ class _Remote:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env=environment,
+            process_group=0,  # a signal to the caller's group must not end it while it starts and ignores none yet
         )
         self._end = weakref.finalize(self, _end_process, self.process)
         self._send(b"I", pickle.dumps((task, count)))
@@ -108,10 +110,12 @@ class _Remote:
             raise self._died()
         return frame
 
-    def _died(self) -> EnvPoolError:
+    def _died(self) -> EnvPoolError | UserError:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(timeout=5)
         code = self.process.poll()
+        if code == -signal.SIGKILL:
+            return UserError(f"{self.name} was killed, most likely for want of memory: ask for fewer with --workers")
         return EnvPoolError(f"{self.name} ended unexpectedly with exit status {code}")
 
 

@@ -99,7 +99,7 @@ def _small_textures() -> Iterator[None]:
     Drawing the mazes' sky is 97 % of the 70 ms that a model takes to compile. Physics is the same to the bit.
     """
     try:
-        import mujoco
+        from dds_lightning.envs.physics import mujoco
     except ImportError:  # an environment without MuJoCo
         yield
         return
@@ -151,8 +151,10 @@ def unpack_step(payload: bytes, action_dim: int) -> tuple[NDArray[np.int64], NDA
 
 def worker_main() -> None:
     """Run a worker process until its input ends."""
-    # Ctrl-C reaches the whole terminal: the caller decides, and the worker ends with it.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Ctrl-C reaches the whole terminal, a scheduler's SIGTERM the whole job: the caller decides, and the worker ends
+    # with it.
+    for signum in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(signum, signal.SIG_IGN)
     source = os.fdopen(os.dup(0), "rb")
     sink = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # whatever a library prints must not land between the frames

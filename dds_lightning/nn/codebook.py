@@ -100,11 +100,12 @@ class Codebook(Bottleneck):
     @torch.no_grad()
     def _observe(self, encodings: Tensor, codes: Tensor) -> None:
         """Update the running usage of each code and, with EMA, move the vectors."""
-        counts = torch.bincount(codes, minlength=self.num_skills).to(encodings.dtype)  # (K,)
-        self.usage.lerp_(counts / codes.numel(), 0.02)
+        encodings = encodings.to(self.usage)  # which has the precision of the weights
+        counts = _of_all(torch.bincount(codes, minlength=self.num_skills).to(encodings))  # (K,)
+        self.usage.lerp_(counts / counts.sum(), 0.02)
         if self.ema_decay is None:
             return
-        sums = torch.zeros_like(self.ema_sum).index_add_(0, codes, encodings)  # (K, D)
+        sums = _of_all(torch.zeros_like(self.ema_sum).index_add_(0, codes, encodings))  # (K, D)
         self.ema_count.lerp_(counts, 1.0 - self.ema_decay)
         self.ema_sum.lerp_(sums, 1.0 - self.ema_decay)
         # Laplace smoothing, so that a code without members keeps a finite vector.
@@ -171,3 +172,10 @@ class Codebook(Bottleneck):
         dead = dead[: chosen.numel()]
         self.set_vectors(dead, encodings[chosen.to(encodings.device)])
         return dead
+
+
+def _of_all(values: Tensor) -> Tensor:
+    """Sum over the processes of a distributed training; every process has its own part of a batch."""
+    if torch.distributed.is_available() and torch.distributed.is_initialized():
+        torch.distributed.all_reduce(values)
+    return values

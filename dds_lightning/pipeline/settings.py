@@ -14,6 +14,7 @@ from dds_lightning.configs import RUN_DEFAULTS, run_defaults
 from dds_lightning.console.reports import Report
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import Task, get_task, is_own
+from dds_lightning.training.alone import run_alone
 from dds_lightning.training.stage_cli import StageCLI, command_line, parsed
 from dds_lightning.training.stages import STAGES, preset_configs
 
@@ -95,8 +96,26 @@ class Trainings:
         # How often the policy is evaluated follows from its steps, which only its parsed settings say.
         self.evaluate_every = self._asked_interval()
         spec = wanted.data or "local:."
-        self._parsed = {stage: parsed(stage, self.arguments(stage, spec)) for stage in STAGES}
+        self._parsed: dict[str, StageCLI] = {}
+        self._in_processes: set[str] = set()
+        self._one_device: set[str] = set()
+        for stage in STAGES:
+            try:
+                self._parse(stage, spec)
+            except UserError as error:
+                raise UserError(f"{stage}: {error}") from error
         self._settle_interval()
+
+    def _parse(self, stage: str, spec: str) -> None:
+        """Parse a training's arguments and try its Trainer, on one device unless more are asked for."""
+        cli = parsed(stage, self.arguments(stage, spec))
+        given = self.wanted.stages.get(stage, ())
+        if cli.settings.trainer.devices == "auto" and not any(one.startswith("--trainer.devices") for one in given):
+            self._one_device.add(stage)
+            cli.settings.trainer.devices = 1
+        if cli.trial_trainer().strategy.launcher is not None:
+            self._in_processes.add(stage)
+        self._parsed[stage] = cli
 
     # ---------------------------------------------------------------- evaluating while the policy trains
 
@@ -168,6 +187,7 @@ class Trainings:
             steps = wanted.clone_steps
             arguments += [f"--trainer.max_steps={steps}", f"--trainer.val_check_interval={min(1000, steps)}"]
         arguments += [f"--trainer.default_root_dir={folder}", f"--checkpoint.dirpath={folder}"]
+        arguments += ["--trainer.devices=1"] if stage in self._one_device else []
         return [*arguments, "--trainer.enable_model_summary=false", *wanted.stages.get(stage, ())]
 
     def settings(self, stage: str) -> dict[str, Any]:
@@ -178,6 +198,8 @@ class Trainings:
         """The settings that a training's result depends on: all of them but places of files and processes."""
         config = self.settings(stage)
         trainer = {key: value for key, value in config["trainer"].items() if key not in _PLACES}
+        if stage in self._one_device:
+            trainer["devices"] = "auto"  # as a run's markers always said it
         if isinstance(trainer.get("callbacks"), list):
             trainer["callbacks"] = [_without(callback, "workers") for callback in trainer["callbacks"]]
         data = {key: value for key, value in config["data"].items() if key not in ("data", "skill", "cache")}
@@ -214,10 +236,13 @@ class Trainings:
 
     def command(self, stage: str, spec: str, skill: Path | None, resume: Path | None) -> str:
         """The command line that `fit` with the same arguments is."""
+        return command_line(stage, self._words(stage, spec, skill, resume))
+
+    def _words(self, stage: str, spec: str, skill: Path | None, resume: Path | None) -> list[str]:
         arguments = self.arguments(stage, spec, skill)
         if resume is not None:
             arguments += [f"--ckpt_path={resume}", "--model.init_from=null"]
-        return command_line(stage, arguments)
+        return arguments
 
     def fit(self, stage: str, spec: str, skill: Path | None = None, resume: Path | None = None) -> Report:
         """Run `dds STAGE fit`.
@@ -228,6 +253,8 @@ class Trainings:
             skill: Checkpoint of the skills, for the policy.
             resume: Checkpoint to go on from.
         """
+        if stage in self._in_processes:
+            return run_alone([stage, *self._words(stage, spec, skill, resume)])
         cli: StageCLI = self._parsed[stage]
         cli.settings.data.data = spec
         if skill is not None:

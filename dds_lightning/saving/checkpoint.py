@@ -10,6 +10,7 @@ import os
 import pickle
 import pickletools
 import re
+import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -31,6 +32,9 @@ from dds_lightning.saving.untrusted import check_plain, regular_file
 FORMAT = 1
 FORMAT_KEY = "dds_format"
 """Entry of a `.ckpt` that holds its version; files of before it have none and are of the first."""
+
+SPAWNED = ".temp.ckpt"
+"""Name under which the processes of `ddp_spawn` hand bare weights to the one that started them."""
 
 STAGE_KEY = "stage"
 """Entry of a `.ckpt` that holds the name of the training stage; older files are known by a setting of theirs."""
@@ -103,6 +107,9 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             UserError: there is no such file, it is damaged, or it holds other objects.
         """
         del map_location, weights_only  # a Trainer moves what it loads to its own device
+        if _is_spawned(Path(path)):
+            weights: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+            return weights
         return load_ckpt(path)
 
     def remove_checkpoint(self, path: str | os.PathLike[str]) -> None:
@@ -112,9 +119,15 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         put them. Lightning would delete folders too.
         """
         place = Path(path)
-        if place.resolve() in self._written and place.is_file() and not place.is_symlink():
+        written = place.resolve() in self._written or _is_spawned(place)
+        if written and place.is_file() and not place.is_symlink():
             place.unlink()
             self._written.discard(place.resolve())
+
+
+def _is_spawned(path: Path) -> bool:
+    """Whether a file holds the bare weights that a process of `ddp_spawn` has left for this one."""
+    return path.name == SPAWNED and path.parent.parent == Path(tempfile.gettempdir())
 
 
 def load_ckpt(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import glob
 import hashlib
 import os
 import secrets
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,9 +27,12 @@ STALE_AFTER = 3600.0
 DISK_ERRORS = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO),  # full or failing
     *(errno.EROFS, errno.EACCES, errno.EPERM),  # no permission to write
-    *(errno.ENOTDIR, errno.EISDIR),  # a path that leads elsewhere
+    *(errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP),  # a path that leads elsewhere
+    *(errno.ESTALE, errno.ENODEV, errno.ENXIO, errno.ETIMEDOUT),  # a share that has gone
 )
 """Errors of a disk that the user can fix."""
+UNSUPPORTED = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
+"""What shares and FUSE answer to a flush that they do not know: the file is in place all the same."""
 
 
 def beside(path: Path) -> Path:
@@ -125,8 +129,31 @@ def sync(path: Path) -> None:
     handle = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
     try:
         os.fsync(handle)
+    except OSError as error:
+        if error.errno not in UNSUPPORTED:
+            raise
     finally:
         os.close(handle)
+
+
+def home() -> Path:
+    """The user's home; where there is none, as in some containers, a folder for temporary files."""
+    try:
+        return Path.home()
+    except RuntimeError:
+        return Path(tempfile.gettempdir()) / f"dds-lightning-{os.getuid() if hasattr(os, 'getuid') else 0}"
+
+
+def expand(path: str | os.PathLike[str]) -> Path:
+    """A path with `~` replaced by the user's home.
+
+    Raises:
+        UserError: It begins with `~` and there is no such home.
+    """
+    try:
+        return Path(path).expanduser()
+    except RuntimeError:
+        raise UserError(f"{path}: there is no home folder here (HOME is not set): give the whole path") from None
 
 
 def sha256(path: Path) -> str:

@@ -29,7 +29,7 @@ from dds_lightning._version import __version__
 from dds_lightning.errors import UserError
 from dds_lightning.saving.arrays import read_tensors
 from dds_lightning.saving.build import build_module
-from dds_lightning.saving.files import folder_written_whole, mend_folder, neighbours, refuse_newer, sha256
+from dds_lightning.saving.files import expand, folder_written_whole, mend_folder, neighbours, refuse_newer, sha256
 from dds_lightning.saving.untrusted import TEXT, mapping, read_json, read_text, read_yaml, regular_file
 
 FORMAT_VERSION = 1
@@ -125,7 +125,7 @@ def publish(
         UserError: Something else is at `directory`, or a value is not plain.
         OSError: It could not be written.
     """
-    target = Path(directory).expanduser().resolve()
+    target = expand(directory).resolve()
     mend_folder(target)
     _refuse_foreign(target)
     entries: dict[str, Any] = {"format_version": FORMAT_VERSION, "dds_lightning": __version__}
@@ -161,7 +161,7 @@ def load_published(directory: str | os.PathLike[str]) -> Published:
     Raises:
         UserError: A file is missing, changed, damaged, or of a newer version; the message names it.
     """
-    directory = Path(directory).expanduser()
+    directory = expand(directory)
     with contextlib.suppress(OSError):
         mend_folder(directory.resolve())
     if not directory.is_dir():

@@ -14,7 +14,6 @@ finish. Otherwise what is there moves to `previous/` and the step starts over.
 """
 
 import errno
-import fcntl
 import hashlib
 import json
 import os
@@ -44,6 +43,8 @@ from dds_lightning.saving.untrusted import (
 FORMAT = 1
 MARKER = "stage.json"
 LOCK, PREVIOUS = "run.lock", "previous"
+NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL)
+"""What Lustre, NFS and other shares answer where locks are not set up."""
 Work = Callable[[Path, bool], Mapping[str, Any]]
 
 
@@ -169,12 +170,7 @@ def locked(root: Path) -> Iterator[None]:
     path = root / LOCK
     try:
         with _opened(path) as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise UserError(
-                    f"out: another `dds run` is working in {root}: wait for it, or choose another --out"
-                ) from None
+            _lock(file, root)
             yield
     finally:
         # A run that ended before its first stage leaves nothing behind.
@@ -193,6 +189,26 @@ def _opened(path: Path) -> IO[bytes]:
         if isinstance(error, OSError) and error.errno != errno.ELOOP:
             raise
         raise UserError(f"out: the lock of this run cannot be opened: {error}; delete it") from None
+
+
+def _lock(file: IO[bytes], root: Path) -> None:
+    """Lock the file of a run directory; where the file system knows no locks, warn and go on."""
+    try:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise UserError(f"out: another `dds run` is working in {root}: wait for it, or choose another --out") from None
+    except ImportError:
+        reason = "this system has none"
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            raise
+        reason = str(error.strerror)
+    else:
+        return
+    told = f"out: {root} cannot be locked ({reason}): do not start a second `dds run` there while this one works"
+    warnings.warn(told, stacklevel=2)
 
 
 def write_json(path: Path, value: Any) -> None:

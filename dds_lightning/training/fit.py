@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import signal
+import sys
 import traceback
 import warnings
 from collections.abc import Iterator
@@ -13,13 +15,15 @@ from typing import Any, NamedTuple
 
 import lightning.pytorch as pl
 import torch
+from lightning.pytorch.strategies.launchers import _MultiProcessingLauncher, _SubprocessScriptLauncher
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
-from dds_lightning.callbacks.best import BestCheckpoint
+from dds_lightning.callbacks.best import BestCheckpoint, callback_state
 from dds_lightning.callbacks.rolling import RollingCheckpoint
 from dds_lightning.console import interrupts
 from dds_lightning.errors import UserError, is_out_of_memory, reason
 from dds_lightning.module import StageModule
+from dds_lightning.saving.checkpoint import load_ckpt
 from dds_lightning.training.stages import Stage, get_stage
 
 _CONNECTOR = "checkpoint_connector.py"
@@ -67,20 +71,69 @@ def fit(
     stage = get_stage(module.STAGE)
     if checkpoint is None:
         module.refuse_frozen_without_weights()
+    spawns = isinstance(trainer.strategy.launcher, _MultiProcessingLauncher)
+    # The processes of `ddp_spawn` defer a signal themselves, and this one passes it on.
+    waits = _standard_output_to_error() if spawns else interrupts.deferred()
     try:
         with (
             resuming(checkpoint),
             advice_on_memory(trainer, module, data),
             torch_threads(stage.threads),
-            interrupts.deferred(),
+            waits,
         ):
             trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     except SIGTERMException:  # before the first step; Lightning would end with status 0
         raise interrupts.Interrupted(signal.SIGTERM) from None
+    except interrupts.Interrupted as stop:
+        if spawns:
+            stop.saved = _end_processes(trainer, stop.signum)
+        raise
+    except BaseException:
+        if isinstance(trainer.strategy.launcher, _SubprocessScriptLauncher):
+            trainer.strategy.launcher.kill(signal.SIGKILL)  # they would wait for this one in a collective
+        raise
     saved = rolling(trainer)
+    if spawns and saved is not None:
+        return _fitted_elsewhere(trainer, saved.place(trainer))
     best = next((c.best_model_path for c in trainer.checkpoint_callbacks if isinstance(c, BestCheckpoint)), None)
     metrics = saved.latest(trainer) if saved else {name: float(x) for name, x in trainer.callback_metrics.items()}
-    return Fitted(saved.path if saved else None, best or None, trainer.global_step, metrics, trainer.log_dir)
+    path = saved.path if saved and saved.path and saved.path.is_file() else None
+    if path is None and saved and checkpoint is not None:
+        path = Path(checkpoint)  # it had been trained for so many steps already
+    return Fitted(path, best or None, trainer.global_step, metrics, trainer.log_dir)
+
+
+@contextlib.contextmanager
+def _standard_output_to_error() -> Iterator[None]:
+    """Let processes that are started inside the block print to standard error: output is the report's alone."""
+    sys.stdout.flush()
+    before = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        yield
+    finally:
+        os.dup2(before, 1)
+        os.close(before)
+
+
+def _fitted_elsewhere(trainer: pl.Trainer, path: Path) -> Fitted:
+    """What the processes of `ddp_spawn` left; of their trainers only the checkpoint and the last metrics are here."""
+    checkpoint = load_ckpt(path)
+    kept = callback_state(checkpoint, RollingCheckpoint) or {}
+    best = callback_state(checkpoint, BestCheckpoint) or {}
+    metrics = {**kept.get("metrics", {}), **{name: float(x) for name, x in trainer.callback_metrics.items()}}
+    return Fitted(path, best.get("best_model_path") or None, checkpoint["global_step"], metrics, trainer.log_dir)
+
+
+def _end_processes(trainer: pl.Trainer, signum: int) -> str | None:
+    """Pass a signal on to the processes of `ddp_spawn`, and wait until they have saved."""
+    launcher: Any = trainer.strategy.launcher
+    launcher.kill(signum)
+    for process in launcher.procs:
+        process.join()
+    saved = rolling(trainer)
+    path = saved.place(trainer) if saved else None
+    return str(path) if path and path.is_file() else None
 
 
 @contextlib.contextmanager
@@ -154,5 +207,6 @@ def quieten() -> None:
         ".*The number of training batches .* is smaller than the logging interval.*",
         ".*isinstance.treespec, LeafSpec.*",
         ".*module.s. in eval mode at the start of training.*",  # the frozen parts of a fine-tuning
+        ".*find_unused_parameters=True was specified.*",
     ):
         warnings.filterwarnings("ignore", message=text)

@@ -7,7 +7,6 @@
 - A mistake in the data is found before the first file is written.
 """
 
-import math
 import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,7 +16,7 @@ import lightning.pytorch as pl
 import torch
 from jsonargparse import ArgumentError, Namespace
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
-from rich.console import Console
+from lightning.pytorch.strategies import DDPStrategy
 
 from dds_lightning.callbacks.average import AverageWeights
 from dds_lightning.callbacks.best import BestCheckpoint
@@ -25,17 +24,24 @@ from dds_lightning.callbacks.convergence import Convergence
 from dds_lightning.callbacks.rolling import RollingCheckpoint
 from dds_lightning.configs import resolve_configs
 from dds_lightning.console.arguments import as_lists, list_options
+from dds_lightning.console.refusals import as_user_errors, sentence
 from dds_lightning.console.reports import Report, table
-from dds_lightning.errors import UserError
+from dds_lightning.errors import UserError, refuse_seed
 from dds_lightning.finetune import read
-from dds_lightning.saving.checkpoint import load_ckpt, stage_of
 from dds_lightning.saving.files import short
 from dds_lightning.saving.untrusted import mapping, parse_yaml
 from dds_lightning.tasks.own import is_address
 from dds_lightning.training.fit import advice_on_memory, fit, quieten
-from dds_lightning.training.precision import fastest_precision
+from dds_lightning.training.precision import settle_precision
+from dds_lightning.training.resuming import (
+    expand_paths,
+    load_checkpoint,
+    named_checkpoint,
+    refuse_conflicts,
+    requeued_checkpoint,
+)
 from dds_lightning.training.stages import get_stage
-from dds_lightning.training.trainer import TrainingSettings, trainer_settings
+from dds_lightning.training.trainer import TrainingSettings, log_places, trainer_settings, trial_trainer
 
 PLACES = ("data", "skill", "relabelled", "cache", "device_resident")
 """Settings of the data that say where they are; a training may go on with them elsewhere."""
@@ -58,6 +64,14 @@ class StageCLI(LightningCLI):
         self.checkpoint: dict[str, Any] | None = None
         self.measured_precision: str | None = None
         parser = {"exit_on_error": False}
+        try:
+            self._parse(parser)
+        except ArgumentError as error:
+            where = f"(see `dds {stage} {next(iter(arguments), 'fit')} --help`)"
+            raise UserError(f"{sentence(error.message)} {where}") from None
+
+    def _parse(self, parser: dict[str, Any]) -> None:
+        """Let Lightning make its parser and parse."""
         super().__init__(
             self.stage.module_class(),
             self.stage.data_class(),
@@ -65,12 +79,12 @@ class StageCLI(LightningCLI):
             save_config_kwargs={"overwrite": True},
             seed_everything_default=0,
             trainer_defaults={
-                "default_root_dir": f"runs/{stage}",
+                "default_root_dir": f"runs/{self.stage.name}",
                 "max_epochs": -1,
                 "max_steps": self.stage.steps,
             },
             parser_kwargs={
-                "prog": f"dds {stage}",
+                "prog": f"dds {self.stage.name}",
                 "description": self.stage.description,
                 **parser,
                 **dict.fromkeys(self.subcommands(), parser),
@@ -105,7 +119,9 @@ class StageCLI(LightningCLI):
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
         """Parse the arguments given to us and never those of the process."""
         self.config = parser.parse_args(args)
+        expand_paths(self.settings)
         data = self.settings.data
+        refuse_seed("--seed_everything", int(self.settings.seed_everything))
         if "seed" in data and data.seed is None:
             data.seed = int(self.settings.seed_everything)
 
@@ -124,7 +140,7 @@ class StageCLI(LightningCLI):
         """Complete the settings from the checkpoint that is named, if one is."""
         settings = self.settings
         if settings.get("ckpt_path") is not None:
-            self.resume(settings.ckpt_path)
+            self.resume(named_checkpoint(str(settings.ckpt_path), settings))
         elif self.config.subcommand != "fit" and not self.parse_only:
             raise UserError(
                 f"--ckpt_path is missing: `dds {self.stage.name} {self.config.subcommand}` needs a checkpoint"
@@ -156,13 +172,8 @@ class StageCLI(LightningCLI):
         task = trained.get("data.task")
         if task and is_address(task) and "data.task" not in chosen:  # a file decides neither what is opened nor run
             raise UserError(f"checkpoint {path} was trained for task {task}: give --data.task={task} again")
+        refuse_conflicts(trained, chosen, path)
         for name, value in trained.items():
-            if name in chosen and chosen[name] != value:
-                raise UserError(
-                    f"--{name} is {chosen[name]!r}, but checkpoint {path} was trained with {value!r}, "
-                    f"and --ckpt_path continues exactly that training: give --{name}={value}, or train "
-                    "anew without --ckpt_path"
-                )
             if name not in linked and name in settings:
                 settings[name] = value
 
@@ -196,9 +207,12 @@ class StageCLI(LightningCLI):
         Raises:
             UserError: They do not fit each other, or the checkpoint.
         """
-        self._choose_precision()
-        super()._set_seed()
-        super().instantiate_classes()
+        if self.config.subcommand == "fit" and (requeued := requeued_checkpoint(self.settings)):
+            self.resume(requeued)
+        self.measured_precision = settle_precision(self.settings)
+        with as_user_errors(self.arguments):
+            super()._set_seed()
+            super().instantiate_classes()
         trained = (self.checkpoint or {}).get("hyper_parameters", {})
         path = self.settings.get("ckpt_path")
         for name in self.stage.links:
@@ -216,20 +230,22 @@ class StageCLI(LightningCLI):
             )
         return self
 
-    def _choose_precision(self) -> None:
-        """Settle `precision: auto`, unless the user or the checkpoint that goes on has."""
-        settings = self.settings
-        if settings.get("precision") != "auto" or settings.trainer.precision is not None:
-            return
-        use_gpu = torch.cuda.is_available() and settings.trainer.accelerator in ("auto", "gpu", "cuda")
-        choice = fastest_precision(use_gpu)
-        settings.trainer.precision = self.measured_precision = choice.precision
-        why = "" if math.isnan(choice.speedup) else f" (bfloat16 is {choice.speedup:.1f} times as fast as float32 here)"
-        Console(stderr=True).print(f"precision: {choice.precision}{why}", style="dim", highlight=False)
+    def trial_trainer(self) -> pl.Trainer:
+        """Make the Trainer alone: what it refuses is found before data and skills are made.
+
+        Raises:
+            UserError: Settings of the Trainer, a logger or a callback that cannot work.
+        """
+        with as_user_errors(self.arguments):
+            return trial_trainer(self.settings.trainer)
 
     def _instantiate_trainer(self, config: dict[str, Any], callbacks: list[pl.Callback]) -> pl.Trainer:
         callbacks = [*callbacks, TrainingSettings(self._settings_to_keep())]
-        return super()._instantiate_trainer(trainer_settings(dict(config), callbacks), [])
+        trainer: pl.Trainer = super()._instantiate_trainer(trainer_settings(dict(config), callbacks), [])
+        alternates = self.model.hparams.get("extraction") == "after"  # of a policy: first the critic, then the actor
+        if alternates and isinstance(trainer.strategy, DDPStrategy):
+            trainer.strategy._ddp_kwargs.setdefault("find_unused_parameters", True)
+        return trainer
 
     def _settings_to_keep(self) -> dict[str, Any]:
         """Seed and settings of the data: with the model's own, what a training cannot change on its way."""
@@ -240,7 +256,17 @@ class StageCLI(LightningCLI):
     # ---------------------------------------------------------------- working
 
     def execute(self) -> Report:
-        """Run the subcommand that was parsed."""
+        """Run the subcommand that was parsed.
+
+        Raises:
+            UserError: Something that Lightning, the data or the checkpoint refuse.
+        """
+        with as_user_errors(self.arguments):
+            report = self._execute()
+        # Of several processes the first one speaks for all.
+        return report if self.trainer.is_global_zero else Report(None, silent=True)
+
+    def _execute(self) -> Report:
         if self.trainer.world_size == 1:
             # Lightning makes its log folder first and looks at the data afterwards.
             self.datamodule.prepare_data()
@@ -254,10 +280,12 @@ class StageCLI(LightningCLI):
     def _fit(self) -> Report:
         made = fit(self.trainer, self.model, self.datamodule, self.settings.get("ckpt_path"))
         saved = {"checkpoint": made.checkpoint, "best": made.best}
-        lines: list[Any] = [f"{made.steps:,} steps; logs in {made.logs}"]
+        lines: list[Any] = [f"{made.steps:,} steps; logs in {log_places(self.trainer)}"]
+        if self.checkpoint is not None and 0 <= self.trainer.max_steps <= self.checkpoint["global_step"]:
+            given = f"trainer.max_steps is {self.trainer.max_steps}: give a greater one to train on"
+            lines = [f"the checkpoint was trained for {made.steps:,} steps already, and {given}"]
         lines += [f"{name}: {path}" for name, path in saved.items() if path]
-        trainer: Any = self.trainer
-        stops = [callback for callback in trainer.callbacks if isinstance(callback, Convergence)]
+        stops = [one for one in self.trainer.callbacks if isinstance(one, Convergence)]  # type: ignore[attr-defined]
         lines += [remark for callback in stops if (remark := callback.remark())]
         return Report({**saved, "steps": made.steps, "metrics": made.metrics, "logs": made.logs}, lines)
 
@@ -295,22 +323,6 @@ class StageCLI(LightningCLI):
         return Report({**data, "codes": usage}, [table(usage), str(path)])
 
 
-def load_checkpoint(path: str, stage: str) -> dict[str, Any]:
-    """Read a Lightning checkpoint of a stage without running code from it.
-
-    Raises:
-        UserError: No such file, unreadable, or another stage's.
-    """
-    try:
-        checkpoint = load_ckpt(path)
-    except UserError as error:
-        raise UserError(f"--ckpt_path: {error}") from None
-    saved = stage_of(checkpoint)
-    if saved != stage:
-        raise UserError(f"--ckpt_path: {path} is a checkpoint of a {saved or 'other'} model, expected a {stage} model")
-    return checkpoint
-
-
 def command(stage: str, arguments: Sequence[str]) -> Callable[[], Report]:
     """Parse the arguments after `dds STAGE` and build what they ask for; the result does the work."""
     quieten()
@@ -332,10 +344,7 @@ def parsed(stage: str, arguments: Sequence[str]) -> StageCLI:
     Raises:
         UserError: Arguments that `dds STAGE fit` does not understand.
     """
-    try:
-        return StageCLI(stage, arguments, parse_only=True)
-    except ArgumentError as error:
-        raise UserError(f"dds {stage} fit: {error.message}") from None
+    return StageCLI(stage, arguments, parse_only=True)
 
 
 def command_line(stage: str, arguments: Sequence[str]) -> str:

@@ -4,12 +4,16 @@ The command line and `dds run` both build their Trainer through `trainer_setting
 differ.
 """
 
+import os
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
+from jsonargparse import Namespace
 from lightning.pytorch.callbacks import Callback, Checkpoint, ProgressBar
+from lightning.pytorch.cli import LightningArgumentParser
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 
 from dds_lightning.callbacks.average import AverageWeights
@@ -17,8 +21,25 @@ from dds_lightning.callbacks.best import BestCheckpoint
 from dds_lightning.callbacks.guard import FiniteGuard
 from dds_lightning.callbacks.resume import ExactResume
 from dds_lightning.callbacks.rolling import RollingCheckpoint
+from dds_lightning.errors import UserError
 from dds_lightning.saving.checkpoint import SETTINGS_KEY, AtomicCheckpointIO
 from dds_lightning.training.progress import StepProgress
+
+QUIET_LOGGERS = ("CSVLogger", "TensorBoardLogger", "WandbLogger", "MLFlowLogger")
+"""Loggers that start nothing before the first value."""
+CLUSTERS = ("MASTER_ADDR", "SLURM_NTASKS", "LSB_JOBID", "OMPI_COMM_WORLD_SIZE")
+"""Variables by which Lightning finds the other nodes."""
+HALF = ("16-true", "bf16-true", "transformer-engine", "transformer-engine-float16")
+RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
+    ("val_check_interval", lambda value: value != 0, "a number of batches, a share of an epoch, or a time"),
+    ("check_val_every_n_epoch", lambda value: value >= 1, "at least 1, or null to count batches across epochs"),
+    ("accumulate_grad_batches", lambda value: value >= 1, "at least 1"),
+    ("limit_train_batches", lambda value: value != 0, "more: nothing would be trained"),
+    ("log_every_n_steps", lambda value: value >= 0, "at least 0"),
+    ("precision", lambda value: value not in HALF, "bf16-mixed or 16-mixed: distances to codes need 32-bit weights"),
+    ("num_nodes", lambda value: value >= 1, "at least 1"),
+)
+"""Settings of the Trainer that fail in the middle of a training, or with which nothing happens, without a word."""
 
 
 class TrainingSettings(Callback):
@@ -49,6 +70,24 @@ def loggers(root: str | Path) -> list[Logger]:
     return [csv, TensorBoardLogger(root, name="logs", version=csv.version)]
 
 
+def log_places(trainer: pl.Trainer) -> str:
+    """The folder of the logs, and the loggers that write elsewhere, for people."""
+    others = [type(one).__name__ for one in trainer.loggers if not isinstance(one, CSVLogger)]
+    return ", ".join([str(trainer.log_dir), *others]) if trainer.loggers else "no place, as asked"
+
+
+def trial_trainer(settings: Namespace) -> pl.Trainer:
+    """Make a Trainer of parsed settings, without the parts of this project that need more than it."""
+    settings = settings.clone()
+    loggers = settings.logger if isinstance(settings.logger, list) else [settings.logger]
+    if any(str(getattr(one, "class_path", "")).rpartition(".")[2] not in QUIET_LOGGERS for one in loggers if one):
+        settings.logger = None
+    parser = LightningArgumentParser(exit_on_error=False)
+    parser.add_lightning_class_args(pl.Trainer, "trainer")
+    made = parser.instantiate_classes(Namespace(trainer=settings))
+    return pl.Trainer(**trainer_settings(made.trainer.as_dict(), []))
+
+
 def trainer_settings(config: dict[str, Any], extra: list[Callback]) -> dict[str, Any]:
     """Complete a Trainer's settings with this project's parts, unless the user chose others.
 
@@ -59,9 +98,22 @@ def trainer_settings(config: dict[str, Any], extra: list[Callback]) -> dict[str,
 
     Returns:
         The keyword arguments to build the Trainer with.
+
+    Raises:
+        UserError: A value of `RULES`.
     """
     config = dict(config)
+    for name, allowed, expected in RULES:
+        if config.get(name) is not None and not allowed(config[name]):
+            raise UserError(f"trainer.{name} is {config[name]}, expected {expected}")
+    if (config.get("num_nodes") or 1) > 1 and not any(name in os.environ for name in CLUSTERS):
+        raise UserError(
+            f"trainer.num_nodes is {config['num_nodes']}, but nothing says where the others are, and Lightning would "
+            "wait for them: start it with srun or torchrun, or set MASTER_ADDR and NODE_RANK"
+        )
     root = config.get("default_root_dir") or "."
+    if config.get("barebones"):
+        return _barebones(config, extra)
     if config.get("logger") is None or config["logger"] is True:
         config["logger"] = loggers(root)
     elif config["logger"] is not False:
@@ -99,3 +151,11 @@ def trainer_settings(config: dict[str, Any], extra: list[Callback]) -> dict[str,
         plugins.append(AtomicCheckpointIO())
     config["plugins"] = plugins
     return config
+
+
+def _barebones(config: dict[str, Any], extra: list[Callback]) -> dict[str, Any]:
+    """Settings that measure the training alone: nothing is logged, saved or drawn."""
+    mine = config.get("callbacks") or []
+    mine = mine if isinstance(mine, list) else [mine]
+    kept = [one for one in extra if not isinstance(one, Checkpoint | AverageWeights)]
+    return {**config, "callbacks": [*mine, *kept, FiniteGuard()]}

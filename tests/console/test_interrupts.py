@@ -4,6 +4,7 @@ import signal
 
 import pytest
 
+from dds_lightning.console import interrupts
 from dds_lightning.console.interrupts import Interrupted, caught, deferred, pending
 
 
@@ -14,7 +15,8 @@ def test_outside_a_training_a_signal_stops_at_once_with_the_status_shells_expect
     assert stop.value.code == status
 
 
-def test_inside_a_training_the_first_signal_waits_and_the_second_does_not():
+def test_inside_a_training_the_first_signal_waits_and_a_later_one_does_not(monkeypatch):
+    monkeypatch.setattr(interrupts, "TOGETHER", 0.0)
     with caught(), deferred():
         signal.raise_signal(signal.SIGTERM)
         assert pending() == signal.SIGTERM

@@ -314,6 +314,14 @@ def test_a_worker_that_dies_is_noticed(broken):
             pool.step(np.full((1, 1), 2.0, np.float32))
 
 
+def test_a_worker_that_the_machine_kills_is_one_sentence_about_memory(broken):
+    with EnvPool(broken, 1, workers=1) as pool:
+        pool.start([[0]])
+        pool._parts[0].process.kill()
+        with pytest.raises(UserError, match=r"worker 0 of 1 \(broken\) was killed.*memory.*--workers"):
+            pool.step(np.zeros((1, 1), np.float32))
+
+
 def _children_gone(pids):
     for _ in range(100):
         alive = []

@@ -167,3 +167,25 @@ def test_the_best_checkpoint_is_of_the_step_that_was_scored_also_at_an_epochs_en
     base = {"limit_train_batches": 5, "check_val_every_n_epoch": None, "val_check_interval": 3}
     fit([RollingCheckpoint("here"), BestCheckpoint("score", every_n_steps=5), Scores()], **base)
     assert step_of("here/best.ckpt") == 5
+
+
+def test_a_metric_that_was_never_logged_leaves_no_best_checkpoint_and_a_warning():
+    with pytest.warns(UserWarning, match=r"best.monitor is val_loss, which was not logged \(.*train/loss"):
+        fit([RollingCheckpoint("here"), BestCheckpoint("val_loss", every_n_steps=5)])
+    assert [path.name for path in Path("here").iterdir()] == ["last.ckpt"]
+
+
+def test_the_last_line_names_the_folder_and_the_loggers_that_write_elsewhere():
+    trainer = fit([])
+    assert training.log_places(trainer) == "out/logs/version_0"
+    assert training.log_places(fit([], logger=False)) == "no place, as asked"
+    trainer.loggers = [*trainer.loggers, TensorBoardLogger.__new__(TensorBoardLogger)]
+    assert training.log_places(trainer) == "out/logs/version_0, TensorBoardLogger"
+
+
+def test_a_folder_that_cannot_be_made_shows_before_the_first_step():
+    Path("file").touch()
+    watched = StepProgress(log_every_n_seconds=0.0)
+    with contextlib.redirect_stderr(io.StringIO()) as said, pytest.raises(OSError, match="file"):
+        fit([RollingCheckpoint("file/here"), watched], enable_progress_bar=True)
+    assert "step" not in said.getvalue()

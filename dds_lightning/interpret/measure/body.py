@@ -13,10 +13,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from dds_lightning.envs.physics import mujoco
 from dds_lightning.interpret.views import view_of
 from dds_lightning.tasks import Task
 from dds_lightning.tasks.bodies import body_of

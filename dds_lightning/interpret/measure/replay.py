@@ -17,13 +17,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import mujoco
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from datamodules.trajectories import Trajectories
+from dds_lightning.envs.physics import mujoco
 from dds_lightning.errors import UserError
 from dds_lightning.interpret.measure.states import BodyStates, Played
 from dds_lightning.tasks import Task

@@ -1,0 +1,156 @@
+"""Sixty wrong command lines: each ends with status 2 and one sentence that says what is wrong; nothing is written.
+
+A line is a row: where it came from does not matter, only that somebody typed it. `S` stands for a training of skills
+that would work, `R` for a run of all stages.
+"""
+
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.fits import QUIET, SKILL, TASK, of_data, told
+
+LINES = [
+    # what Lightning refuses
+    ("S --trainer.accelerator=gpuu", "accelerator='gpuu'"),
+    ("S --trainer.accelerator=tpu", "torch_xla"),
+    ("S --trainer.strategy=dpp", "strategy='dpp'"),
+    ("S --trainer.devices=0", "devices"),
+    ("S --trainer.devices=many", "--trainer.devices=many"),
+    ("S --trainer.profiler=simpel", "'simple'"),
+    ("S --trainer.logger=WandbLogger", "pip install -e '.[log]'"),
+    ("S --trainer.logger=WandbLoger", "did you mean WandbLogger?"),
+    ("S --trainer.logger=CSVLogger", "CSVLogger needs save_dir: give --trainer.logger.save_dir=VALUE"),
+    ("S --trainer.callbacks+=EarlyStopping", "EarlyStopping needs monitor"),
+    ("S --trainer.callbacks+=EarlyStoping", "did you mean EarlyStopping?"),
+    (
+        "S --trainer.callbacks+=EarlyStopping --trainer.callbacks.moniter=x",
+        "has no argument moniter: did you mean monitor",
+    ),
+    ("S --trainer.precision=16-mixd", "did you mean 16-mixed"),
+    ("S --trainer.num_nodes=0", "trainer.num_nodes is 0"),
+    ("S --trainer.limit_train_batches=0", "nothing would be trained"),
+    ("S --trainer.limit_train_batches=-1", "limit_train_batches"),
+    ("S --trainer.max_time=soon", "soon"),
+    ("S --trainer.accumulate_grad_batches=0", "at least 1"),
+    ("S --trainer.max_steps=-2", "-2"),
+    # found by `dds run` before data and skills are made
+    ("R --policy.trainer.accelerator=gpuu", "policy: "),
+    ("R --policy.trainer.strategy=dpp", "policy: "),
+    ("R --clone.trainer.devices=0", "clone: "),
+    ("R --policy.trainer.logger=WandbLogger", "pip install -e '.[log]'"),
+    ("R --policy.trainer.logger=CSVLogger", "CSVLogger needs save_dir"),
+    ("R --policy.trainer.precision=16-mixd", "did you mean 16-mixed"),
+    ("R --skill.model.encoder=transfomer", "did you mean transformer?"),
+    ("R --skill.model.num_skills=few", "num_skills is few, expected a whole number"),
+    # options that do not exist
+    ("S --nope", "--nope is not an option of `dds skill fit`"),
+    ("S --modle.lr=1", "did you mean --model.lr"),
+    ("S --model.lrr=1", "did you mean --model.lr"),
+    ("S --data.horzon=5", "did you mean --data.horizon"),
+    ("S --trainer.max_stps=3", "see `dds skill fit --help trainer`"),
+    ("S --trainer.acelerator=cpu", "did you mean --trainer.accelerator"),
+    ("S --checkpont.dirpath=x", "did you mean --checkpoint.dirpath"),
+    ("S --best.moniter=x", "did you mean --best.monitor"),
+    ("skill fti", "did you mean fit?"),
+    ("skil fit", "did you mean skill?"),
+    ("R --epsiodes 3", "did you mean --episodes?"),
+    ("R --polcy.trainer.max_steps=3", "did you mean --policy?"),
+    ("R --policy.trianer.max_steps=3", "did you mean --policy.trainer.max_steps"),
+    ("R --skill.model.nope=1", "--skill.model.nope is not an option of `dds skill fit`"),
+    ("data colect", "did you mean collect?"),
+    ("checkpoints verfy", "did you mean verify?"),
+    ("evaluate nowhere --selction greedy", "did you mean --selection?"),
+    ("tasks --jsn", "did you mean --json?"),
+    # values that do not fit
+    ("S --model.lr=fast", "model.lr is fast, expected a number"),
+    ("S --model.encoder=transfomer", "did you mean transformer?"),
+    ("S --model.lr_scale=1", "a mapping such as"),
+    ("S --trainer.max_steps=3.5", "trainer.max_steps is 3.5, expected a whole number"),
+    ("S --model.lr", "--model.lr"),
+    ("R --until lunch", "until"),
+    ("R --episodes 0", "--episodes is 0"),
+    # seeds
+    ("S --seed_everything=-1", "--seed_everything is -1, expected a whole number from 0"),
+    ("S --seed_everything=20261128123456", "20261128123456"),
+    ("S --data.seed=-1", "data.seed is -1"),
+    ("R --seed=-1", "--seed is -1"),
+    ("R --seed=20261128123456", "--seed is 20261128123456"),
+    ("R --skill.seed_everything=-1", "--seed_everything is -1"),
+    (f"data collect {TASK} --seed=-1", "--seed is -1"),
+    ("evaluate nowhere --seed=-1", "--seed is -1"),
+    # checkpoints
+    ("S --ckpt_path=last", "there is no last.ckpt in runs/skill/logs"),
+    ("S --ckpt_path=none.ckpt", "there is no checkpoint none.ckpt"),
+    ("S --model.init_from=none.ckpt", "none.ckpt"),
+    ("skill validate", "--ckpt_path is missing"),
+    ("policy fit", "data.skill is missing"),
+]
+LATE = [
+    ("--trainer.val_check_interval=5000", "val_check_interval"),
+    ("--trainer.callbacks+=EarlyStopping --trainer.callbacks.monitor=val_loss --trainer.max_steps=60", "`val_loss`"),
+    ("--best.monitor=val_loss --trainer.max_steps=60", "monitor='val_loss'"),
+]
+"""What shows only when the training has begun."""
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return of_data(tmp_path_factory.mktemp("data"))
+
+
+def words_of(line, data):
+    first, *rest = shlex.split(line)
+    before = {"S": ["skill", "fit", *data, *QUIET, *SKILL, "--trainer.max_steps=3"], "R": ["run", TASK]}
+    return [*before.get(first, [first]), *rest]
+
+
+def test_there_are_sixty():
+    assert len(LINES) >= 60
+
+
+@pytest.mark.parametrize(("line", "part"), LINES, ids=[line for line, _ in LINES])
+def test_a_wrong_line_is_one_sentence_status_2_and_no_file(dds, data, line, part):
+    answer = dds(*words_of(line, data))
+    assert (answer.status, answer.out) == (2, "")
+    assert part in told(answer.err)
+    assert list(Path().rglob("*")) == []
+
+
+@pytest.mark.parametrize(("words", "part"), LATE)
+def test_what_shows_only_in_training_is_one_sentence_too(dds, data, words, part):
+    answer = dds(*words_of(f"S {words}", data))
+    assert answer.status == 2
+    assert part in told(answer.err)
+
+
+def test_slurm_variables_that_do_not_fit_are_one_sentence(dds, data, monkeypatch):
+    monkeypatch.setenv("SLURM_NTASKS", "4")
+    answer = dds(*words_of("S", data))
+    assert answer.status == 2
+    assert "--ntasks" in told(answer.err)
+
+
+TYPOS = [
+    ["skill", "fit", "--model.lrr=1"],
+    ["skill", "fit", "--model.encoder=transfomer"],
+    ["run", TASK, "--policy.trianer.max_steps=3"],
+    ["policy", "fti"],
+]
+
+
+@pytest.mark.parametrize("words", [["skill", "fit", "--help"], ["skill", "fit", "--help", "trainer"], *TYPOS])
+def test_help_and_typos_are_answered_at_once(words):
+    """In a new process, two seconds of processor time."""
+    import resource
+    import subprocess
+
+    code = "import sys; from dds_lightning.cli import main; status = main(sys.argv[1:]);"
+    code += "assert 'torch' not in sys.modules; sys.exit(status)"
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    ran = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=False)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert ran.returncode == (0 if "--help" in words else 2), ran.stderr
+    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 2.0
