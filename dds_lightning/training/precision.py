@@ -15,6 +15,8 @@ from torch import nn
 WIDTH, ROWS, REPEATS = 128, 640, 9
 SETTLED = "DDS_PRECISION"
 """Variable by which the processes of one training agree."""
+OVERRULED = "auto: measure whether bfloat16 is faster here; --trainer.precision overrules it"
+"""Help of the option."""
 WORTH = 1.2
 """How much faster bfloat16 must be to be chosen."""
 

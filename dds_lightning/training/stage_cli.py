@@ -32,7 +32,7 @@ from dds_lightning.saving.files import short
 from dds_lightning.saving.untrusted import mapping, parse_yaml
 from dds_lightning.tasks.own import is_address
 from dds_lightning.training.fit import advice_on_memory, fit, quieten
-from dds_lightning.training.precision import settle_precision
+from dds_lightning.training.precision import OVERRULED, settle_precision
 from dds_lightning.training.resuming import (
     expand_paths,
     load_checkpoint,
@@ -101,12 +101,7 @@ class StageCLI(LightningCLI):
         parser.add_lightning_class_args(BestCheckpoint, "best")
         parser.add_lightning_class_args(AverageWeights, "average")
         parser.add_lightning_class_args(Convergence, "stop")
-        parser.add_argument(
-            "--precision",
-            type=Literal["auto"] | None,
-            default=None,
-            help="auto: measure whether bfloat16 is faster here; --trainer.precision overrules it",
-        )
+        parser.add_argument("--precision", type=Literal["auto"] | None, default=None, help=OVERRULED)
         parser.add_argument("--json", action="store_true", help="print one JSON document and nothing else")
         for name in self.stage.links:
             parser.link_arguments(f"data.{name}", f"model.{name}", apply_on="instantiate")
