@@ -7,7 +7,7 @@ from typing import Any
 import docstring_parser
 from jsonargparse import ArgumentParser
 
-from dds_lightning.cli import atlas, checkpoints, commands, data, record
+from dds_lightning.cli import atlas, checkpoints, commands, data, online, record
 from dds_lightning.console.arguments import as_lists, list_options
 from dds_lightning.errors import UserError
 from dds_lightning.training.stages import STAGES
@@ -17,6 +17,7 @@ Commands = Mapping[str, Any]  # name -> function, a group of commands, or None f
 GROUPS = {
     "data": "List, show, check, fetch and collect data sets.",
     "checkpoints": "List and verify published agents.",
+    "online": STAGES["online"].description,
 }
 OPTIONAL_POSITIONALS: dict[Callable[..., Any], tuple[str, str]] = {
     commands.tasks: ("name", "?"),
@@ -34,6 +35,7 @@ def command_table() -> Commands:
     return {
         "run": commands.run,
         **dict.fromkeys(STAGES),
+        "online": {"compare": online.compare},  # beside the stage's own `fit`
         "relabel": commands.relabel,
         "evaluate": commands.evaluate,
         "report": commands.report,
