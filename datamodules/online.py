@@ -255,7 +255,7 @@ class OnlineLoader:
             if self.data.space == "discrete":
                 return torch.randint(self.data.choices, shape, generator=generator).numpy()
             unit = 2.0 * torch.rand(*shape, self.data.choices, generator=generator) - 1.0
-            return module.action_box.cpu().from_unit(unit).numpy()
+            return module.action_box.from_unit(unit.to(module.device)).cpu().numpy()
         with torch.no_grad():
             x = torch.from_numpy(observations).to(module.device)
             return module.choose(x, generator=generator).cpu().numpy()
