@@ -58,7 +58,8 @@ ROOMS = {
     "datamodules.trajectories",
     "datamodules.relabelled": "errors skill tasks datamodules.loader datamodules.partial_codes datamodules.relabel "
     "datamodules.relabelling datamodules.sources datamodules.trajectories",
-    "datamodules.online": "errors online skill tasks datamodules.relabel datamodules.relabelled datamodules.relabelling",
+    "datamodules.online": "errors online skill tasks datamodules.relabel datamodules.relabelled "
+    "datamodules.relabelling",
     # training
     "dds_lightning.callbacks": "agent console envs errors online policy rollout skill tasks",
     "dds_lightning.training": "callbacks configs console errors finetune module saving tasks",
@@ -74,11 +75,11 @@ ROOMS = {
     "dds_lightning.study": "agent callbacks console errors interpret.atlas interpret.draw interpret.measure policy "
     "rollout saving skill tasks datamodules.collect datamodules.relabel datamodules.relabelling datamodules.sources",
     "dds_lightning.sharing": "agent errors saving tasks training",
-    "dds_lightning.pipeline": "agent baselines configs console errors interpret.draw online policy rollout saving skill study tasks training "
-    "datamodules.collect datamodules.inspection datamodules.relabelled datamodules.relabelling datamodules.relabel "
-    "datamodules.sources",
-    "dds_lightning.cli": "_version agent console errors interpret.draw online pipeline policy saving sharing skill study "
-    "tasks training datamodules.collect datamodules.inspection datamodules.listing datamodules.physics "
+    "dds_lightning.pipeline": "agent baselines configs console errors interpret.draw online policy rollout saving "
+    "skill study tasks training datamodules.collect datamodules.inspection datamodules.relabelled "
+    "datamodules.relabelling datamodules.relabel datamodules.sources",
+    "dds_lightning.cli": "_version agent console errors interpret.draw online pipeline policy saving sharing skill "
+    "study tasks training datamodules.collect datamodules.inspection datamodules.listing datamodules.physics "
     "datamodules.relabel datamodules.relabelled datamodules.relabelling datamodules.sources",
     "dds_lightning.__main__": "cli",
 }
