@@ -72,8 +72,9 @@ ROOMS = {
     "datamodules.inspection datamodules.trajectories",
     "dds_lightning.interpret.atlas": "interpret.draw interpret.measure interpret.views rollout saving tasks "
     "datamodules.trajectories",
-    "dds_lightning.study": "agent callbacks console errors interpret.atlas interpret.draw interpret.measure policy "
-    "rollout saving skill tasks datamodules.collect datamodules.relabel datamodules.relabelling datamodules.sources",
+    "dds_lightning.study": "agent callbacks console errors interpret.atlas interpret.draw interpret.measure online "
+    "policy rollout saving skill tasks datamodules.collect datamodules.relabel datamodules.relabelling "
+    "datamodules.sources",
     "dds_lightning.sharing": "agent errors saving tasks training",
     "dds_lightning.pipeline": "agent baselines configs console errors interpret.draw online policy rollout saving "
     "skill study tasks training datamodules.collect datamodules.inspection datamodules.relabelled "
