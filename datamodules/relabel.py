@@ -29,6 +29,7 @@ from datamodules.relabelling import Discount as Discount
 from datamodules.relabelling import Relabelling
 from datamodules.trajectories import Trajectories
 from dds_lightning.console.progress import on_terminal, track
+from dds_lightning.envs.semi_mdp import fold
 from dds_lightning.errors import UserError
 from dds_lightning.saving.arrays import read_tensors
 from dds_lightning.saving.files import refuse_newer, written_whole
@@ -293,12 +294,7 @@ def _transitions(trajectories: Trajectories, skill: SkillModule, settled: Relabe
     windows = trajectories.windows(skill.horizon, settled.stride, tail="terminated")
     starts, observation_starts, lengths = windows.starts, windows.observation_starts, windows.lengths
     learning = settled.learning_rewards(trajectories, skill.horizon)  # (N,)
-    gamma = settled.gamma
-    rewards = np.zeros(len(starts))
-    for i in range(skill.horizon):
-        taken = i < lengths
-        rewards[taken] += gamma**i * learning[starts[taken] + i]
-    factor = np.full(len(starts), gamma) if settled.discount == "per_skill" else gamma**lengths
+    rewards, factor = fold(learning, starts, lengths, settled.gamma, settled.discount)
     ends = starts + lengths - 1  # (M,) last step of each segment
     return Relabelled(
         observations=torch.as_tensor(trajectories.observations[observation_starts]),

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from dds_lightning.envs.semi_mdp import Discount as Discount
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import Task
 
 if TYPE_CHECKING:
     from datamodules.trajectories import Trajectories
 
-Discount = Literal["per_skill", "per_step"]
 Auto = Literal["auto"]
 
 RETURN_SPREAD = 10.0

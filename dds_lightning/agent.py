@@ -21,6 +21,8 @@ from dds_lightning.errors import UserError
 from dds_lightning.saving.files import short
 
 if TYPE_CHECKING:
+    from dds_lightning.online.parts import RawActions
+    from dds_lightning.online.sac import SACModule
     from dds_lightning.policy import PolicyModule
     from dds_lightning.skill import SkillModule
 
@@ -36,12 +38,12 @@ class DDSAgent(nn.Module):
     action = agent.act(observation)  # in the environment's units, inside its box
     ```
 
-    The agent has its own random stream: the same seed gives the same actions, and the global streams stay
-    untouched. Networks are put in evaluation mode and used where they are; nothing is copied.
+    The same seed gives the same actions: the agent has its own random stream. Networks are put in evaluation mode and
+    used where they are; nothing is copied.
 
     Args:
-        skill: Decoder and codebook.
-        policy: Chooses codes; None for an agent whose `selection` is `random` or `fixed`.
+        skill: Decoder and skills, discrete or continuous; `RawActions` for an agent without.
+        policy: Chooses skills; None for an agent whose `selection` is `random` or `fixed`.
         selection: `sample` from the policy, `greedy` its likeliest code, `argmax_q` the critic's best
             supported code, `random` any code with equal chance, `fixed` the codes of `fixed_codes`.
         temperature: Divides the policy's logits before sampling.
@@ -55,8 +57,8 @@ class DDSAgent(nn.Module):
 
     def __init__(
         self,
-        skill: SkillModule,
-        policy: PolicyModule | None = None,
+        skill: SkillModule | RawActions,
+        policy: PolicyModule | SACModule | None = None,
         selection: AgentSelection = "sample",
         temperature: float = 1.0,
         noise_scale: float | None = None,
@@ -65,9 +67,11 @@ class DDSAgent(nn.Module):
     ) -> None:
         """Put the parts together."""
         super().__init__()
-        self.skill, self.policy = skill, policy
+        self.skill: SkillModule = skill  # type: ignore[assignment]  # what shows codes asks for the kinds it can show
+        self.policy: PolicyModule | None = policy  # type: ignore[assignment]
+        self.discrete = bool(getattr(skill, "discrete", True))
         self.selection, self.temperature, self._noise_scale = selection, float(temperature), noise_scale
-        self.horizon, self.num_skills = int(skill.horizon), int(skill.num_skills)
+        self.horizon, self.num_skills = int(skill.horizon), int(skill.num_skills) if self.discrete else 0
         self.observation_dim = int(skill.hparams["observation_dim"])
         self.action_dim = int(skill.hparams["action_dim"])
         self.fixed_codes = None if fixed_codes is None else np.asarray(fixed_codes, dtype=np.int64)
@@ -75,14 +79,12 @@ class DDSAgent(nn.Module):
         self.eval()
         self._seed = int(seed)
         self._generator: torch.Generator | None = None
-        self._codes = np.zeros(0, dtype=np.int64)  # (E,) code in use
-        self._clock = np.zeros(0, dtype=np.int64)  # (E,) steps until the next choice
-        self._decided = np.zeros(0, dtype=bool)  # (E,) whether the last act chose a new one
+        self._begin(0)
 
     def _check(self) -> None:
         choices, codes, last = get_args(AgentSelection), self.fixed_codes, self.num_skills - 1
-        if not getattr(self.skill, "discrete", True):
-            raise UserError("the skill model's bottleneck is gaussian: an agent needs discrete skills (vq)")
+        if not self.discrete and self.selection in ("fixed", "argmax_q"):
+            raise UserError(f"selection is '{self.selection}', which needs codes, but the skills are continuous")
         if self.selection not in choices:
             raise UserError(f"selection is '{self.selection}', expected one of {', '.join(choices)}")
         if not 0 < self.temperature < np.inf:
@@ -96,9 +98,9 @@ class DDSAgent(nn.Module):
         if codes is not None and (codes.ndim != 1 or not len(codes) or codes.min() < 0 or codes.max() > last):
             raise UserError(f"fixed_codes is {codes}, expected a list of codes of 0 to {last}")
         if self.policy is not None:
+            theirs: Any = {"num_skills": getattr(self.policy, "num_skills", None), **self.policy.hparams}
             for name in ("num_skills", "observation_dim"):
-                mine, other = self.skill.hparams[name], self.policy.hparams[name]
-                if mine != other:
+                if (mine := getattr(self, name)) != (other := theirs[name]):
                     raise UserError(
                         f"{name} is {mine} in the skill model and {other} in the policy: they do not belong together"
                     )
@@ -135,8 +137,8 @@ class DDSAgent(nn.Module):
         return len(self._codes)
 
     @property
-    def codes(self) -> NDArray[np.int64]:
-        """(E,) code in use in each environment; 0 before the first act."""
+    def codes(self) -> NDArray[Any]:
+        """(E,) code or (E, D) skill in use in each environment; 0 before the first act."""
         return self._codes.copy()
 
     @property
@@ -147,7 +149,7 @@ class DDSAgent(nn.Module):
     @property
     def device(self) -> torch.device:
         """Where the networks are."""
-        return next(self.skill.parameters()).device
+        return next(self.parameters()).device
 
     def reset(self, num_envs: int = 1, seed: int | None = None) -> None:
         """Restart all clocks.
@@ -160,9 +162,13 @@ class DDSAgent(nn.Module):
             raise UserError(f"num_envs is {num_envs}, expected at least 1")
         if seed is not None:
             self._seed, self._generator = int(seed), None
-        self._codes = np.zeros(num_envs, dtype=np.int64)
-        self._clock = np.zeros(num_envs, dtype=np.int64)
-        self._decided = np.zeros(num_envs, dtype=bool)
+        self._begin(num_envs)
+
+    def _begin(self, count: int) -> None:
+        width = () if self.discrete else (int(self.skill.hparams["skill_dim"]),)
+        self._codes: NDArray[Any] = np.zeros((count, *width), np.float32 if width else np.int64)  # code or skill in use
+        self._clock = np.zeros(count, dtype=np.int64)  # (E,) steps until the next choice
+        self._decided = np.zeros(count, dtype=bool)  # (E,) whether the last act chose a new one
 
     @torch.inference_mode()
     def act(
@@ -211,10 +217,8 @@ class DDSAgent(nn.Module):
             )
         return torch.from_numpy(np.ascontiguousarray(observations)).to(self.device)
 
-    def choose(
-        self, observations: Tensor, restarted: NDArray[np.bool_] | None, rows: NDArray[np.intp]
-    ) -> NDArray[np.int64]:
-        """Advance the clocks of `rows`, with a new choice where one has run out: (n, O) to codes (n,)."""
+    def choose(self, observations: Tensor, restarted: NDArray[np.bool_] | None, rows: NDArray[np.intp]) -> NDArray[Any]:
+        """Advance the clocks of `rows`, with a new choice where one has run out: (n, O) to codes (n,) or skills."""
         if restarted is not None:
             self._clock[rows[restarted]] = 0
         due = self._clock[rows] == 0  # (n,)
@@ -227,27 +231,28 @@ class DDSAgent(nn.Module):
         self._clock[rows] -= 1
         return self._codes[rows]
 
-    def _pick(self, observations: Tensor, rows: NDArray[np.intp]) -> NDArray[np.int64]:
-        """Codes (m,) for the m environments whose skill has run out."""
+    def _pick(self, observations: Tensor, rows: NDArray[np.intp]) -> NDArray[Any]:
+        """Codes (m,) or skills (m, D) for the m environments whose skill has run out."""
         if self.selection == "fixed":
             assert self.fixed_codes is not None
             return self.fixed_codes[rows % len(self.fixed_codes)]
         stream = self.generator()
-        if self.selection == "random":
-            codes = torch.randint(self.num_skills, (len(rows),), generator=stream, device=stream.device)
+        if self.selection == "random" and self.discrete:
+            chosen = torch.randint(self.num_skills, (len(rows),), generator=stream, device=stream.device)
+        elif self.selection == "random":  # from the prior of continuous skills
+            chosen = torch.randn(len(rows), self._codes.shape[1], generator=stream, device=stream.device)
         else:
             assert self.policy is not None
             self.policy.eval() if self.policy.training else None
-            codes = self.policy.codes(
-                observations, selection=self.selection, temperature=self.temperature, generator=stream
-            )
-        return codes.cpu().numpy()
+            choose: Any = getattr(self.policy, "codes" if self.discrete else "choose")
+            chosen = choose(observations, self.selection, self.temperature, stream)
+        return chosen.cpu().numpy()
 
-    def decode(self, observations: Tensor, codes: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Actions (n, A) of codes (n,) in observations (n, O)."""
+    def decode(self, observations: Tensor, codes: NDArray[Any]) -> NDArray[np.float32]:
+        """Actions (n, A) of codes (n,) or skills (n, D) in observations (n, O)."""
         self.skill.eval() if self.skill.training else None
         index = torch.from_numpy(codes).to(observations.device)
-        actions = self.skill.decode(observations, index, noise_scale=self.noise_scale, generator=self.generator())
+        actions = self.skill.decode(observations, index, self.noise_scale, self.generator())
         return actions.float().cpu().numpy()
 
     def generator(self) -> torch.Generator:
@@ -268,19 +273,22 @@ class DDSAgent(nn.Module):
         """Return the networks' answers to fixed questions, stored with published weights to recognise them by.
 
         Returns:
-            `actions` (8, A) for fixed states, codes and noise, and, with a policy, its `logits` (8, K; 0 where the
-            data have no support). Six digits: other processors round differently.
+            `actions` (8, A) for fixed states, skills and noise, and, with a policy, its `logits` (8, K; 0 where the
+            data have no support) or its `choices` (8, D). Six digits: other processors round differently.
         """
-        rows = 8
-        wave = torch.arange(rows * self.observation_dim, device=self.device).reshape(rows, -1).float().sin()
-        skill = self.skill.eval()
+        rows, skill, device = 8, self.skill.eval(), self.device
+        wave = torch.arange(rows * self.observation_dim, device=device).reshape(rows, -1).float().sin()
         observations = skill.normaliser.mean + skill.normaliser.std * wave  # (8, O), as the data are spread
-        codes = torch.arange(rows, device=self.device) % self.num_skills
+        codes = torch.arange(rows, device=device) % max(self.num_skills, 1)
+        skills = codes if self.discrete else wave[:, :1].expand(rows, self._codes.shape[1])
         count = skill.draws * rows * self.action_dim
-        noise = torch.arange(count, device=self.device).reshape(-1, rows, self.action_dim).float().cos()
-        answers = {"actions": skill.decode_from(observations, codes, noise)}
-        if self.policy is not None:
+        noise = torch.arange(count, device=device).reshape(skill.draws, rows, self.action_dim).float().cos()
+        answers = {"actions": skill.decode_from(observations, skills, noise)}
+        if self.policy is not None and self.discrete:
             answers["logits"] = self.policy.eval().logits(observations).nan_to_num(neginf=0.0)
+        elif self.policy is not None:
+            policy: Any = self.policy.eval()
+            answers["choices"] = policy.choose(observations, "greedy")
         return {name: [[round(x, 6) for x in row] for row in answer.tolist()] for name, answer in answers.items()}
 
     def save(
@@ -307,11 +315,8 @@ class DDSAgent(nn.Module):
         """
         from dds_lightning.saving.published import publish
 
-        modules: dict[str, nn.Module] = {"skill": self.skill}
-        if self.policy is not None:
-            modules["policy"] = self.policy
-        acting: dict[str, Any] = {"selection": self.selection, "temperature": self.temperature}
-        acting["noise_scale"] = self._noise_scale  # null goes on meaning the skill model's
+        modules: Any = {part.STAGE: part for part in self.children() if hasattr(part, "STAGE")}  # not of raw actions
+        acting = {"selection": self.selection, "temperature": self.temperature, "noise_scale": self._noise_scale}
         acting["fixed_codes"] = None if self.fixed_codes is None else self.fixed_codes.tolist()
         return publish(directory, modules, {**about, "agent": acting, "golden": self.golden()}, metrics, card)
 
@@ -326,15 +331,13 @@ class DDSAgent(nn.Module):
         Raises:
             UserError: Files are missing, changed, of a newer version, or do not fit; the message names them.
         """
-        from dds_lightning.policy import PolicyModule
+        from dds_lightning.online.parts import published_parts
         from dds_lightning.saving.hub import is_hub, pull
         from dds_lightning.saving.published import load_published
-        from dds_lightning.skill import SkillModule
 
         directory = pull(str(directory)) if is_hub(directory) else directory
         published = load_published(directory)
-        skill = published.module(SkillModule, "skill")
-        policy = published.module(PolicyModule, "policy") if "policy" in published.config else None
+        skill, policy = published_parts(published)
         acting = {**published.acting(), **settings}
         if acting["selection"] != "fixed":
             acting.pop("fixed_codes", None)

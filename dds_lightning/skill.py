@@ -221,12 +221,16 @@ class SkillModule(StageModule):
     def decode(
         self,
         observations: Tensor,
-        codes: Tensor,
+        skills: Tensor,
         noise_scale: float | None = None,
         generator: torch.Generator | None = None,
     ) -> Tensor:
-        """Draw actions (B, A) for observations (B, O) under codes (B,)."""
-        return self.decode_vectors(observations, self.bottleneck.lookup(codes), noise_scale, generator)
+        """Draw actions (B, A) for observations (B, O) under skills: codes (B,) or vectors (B, D)."""
+        return self.decode_vectors(observations, self.vectors(skills), noise_scale, generator)
+
+    def vectors(self, skills: Tensor) -> Tensor:
+        """Skill vectors (B, D) of codes (B,); vectors are returned as they are."""
+        return skills if skills.is_floating_point() else self.bottleneck.lookup(skills)
 
     def decode_vectors(
         self,
@@ -244,11 +248,10 @@ class SkillModule(StageModule):
         """N, Gaussians that the decoder draws for one action."""
         return int(self.decoder.draws)
 
-    def decode_from(self, observations: Tensor, codes: Tensor, noise: Tensor) -> Tensor:
+    def decode_from(self, observations: Tensor, skills: Tensor, noise: Tensor) -> Tensor:
         """`decode` with given noise (N, B, A), the noise scale included: a function of its arguments."""
-        vectors = self.bottleneck.lookup(codes)
         decoder: Any = self.decoder
-        return self.action_box.from_unit(decoder.denoise(noise, self.normaliser(observations), vectors))
+        return self.action_box.from_unit(decoder.denoise(noise, self.normaliser(observations), self.vectors(skills)))
 
     def on_fit_start(self) -> None:
         """Take the data's statistics and start the bottleneck, unless a checkpoint brought both."""

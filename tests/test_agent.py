@@ -289,8 +289,8 @@ def test_parts_that_do_not_fit_are_refused():
     with pytest.raises(UserError, match="num_skills is 4 in the skill model and 5 in the policy"):
         DDSAgent(skill, PolicyModule(4, 5, hidden_dims=(8,)))
     gaussian = SkillModule(4, 2, bottleneck="gaussian", hidden_dim=16, encoder_layers=1, encoder_heads=2)
-    with pytest.raises(UserError, match="gaussian"):
-        DDSAgent(gaussian, None, "random")
+    with pytest.raises(UserError, match="selection is 'fixed', which needs codes, but the skills are continuous"):
+        DDSAgent(gaussian, None, "fixed", fixed_codes=[0])
 
 
 # ---------------------------------------------------------------- many agents, one decoder

@@ -32,7 +32,8 @@ ROOMS = {
     "dds_lightning.module": "errors finetune nn saving",
     "dds_lightning.skill": "errors module nn",
     "dds_lightning.policy": "errors losses module nn",
-    "dds_lightning.agent": "envs errors policy saving skill",
+    "dds_lightning.online": "envs errors losses module nn policy saving skill",
+    "dds_lightning.agent": "envs errors online policy saving skill",
     "dds_lightning.rollout": "console errors envs saving tasks",
     # the data
     "datamodules.validation": "errors",
@@ -50,16 +51,18 @@ ROOMS = {
     "datamodules.inspection": "tasks datamodules.sources datamodules.trajectories",
     "datamodules.listing": "errors tasks datamodules.sources datamodules.storage datamodules.trajectories",
     "datamodules.partial_codes": "errors saving",
-    "datamodules.relabelling": "errors tasks",
-    "datamodules.relabel": "console errors saving skill datamodules.partial_codes datamodules.relabelling "
+    "datamodules.relabelling": "envs errors tasks",
+    "datamodules.relabel": "console envs errors saving skill datamodules.partial_codes datamodules.relabelling "
     "datamodules.trajectories",
     "datamodules.segments": "errors nn tasks datamodules.collect datamodules.loader datamodules.sources "
     "datamodules.trajectories",
     "datamodules.relabelled": "errors saving skill tasks datamodules.loader datamodules.partial_codes "
     "datamodules.relabel "
     "datamodules.relabelling datamodules.sources datamodules.trajectories",
+    "datamodules.online": "errors online skill tasks datamodules.relabel datamodules.relabelled "
+    "datamodules.relabelling",
     # training
-    "dds_lightning.callbacks": "agent console envs errors policy rollout skill tasks",
+    "dds_lightning.callbacks": "agent console envs errors online policy rollout skill tasks",
     "dds_lightning.training": "callbacks configs console errors finetune module saving tasks",
     "dds_lightning.baselines": "errors module nn rollout tasks training",
     # what came of it
@@ -70,14 +73,15 @@ ROOMS = {
     "datamodules.inspection datamodules.trajectories",
     "dds_lightning.interpret.atlas": "interpret.draw interpret.measure interpret.views rollout saving tasks "
     "datamodules.trajectories",
-    "dds_lightning.study": "agent callbacks console errors interpret.atlas interpret.draw interpret.measure policy "
-    "rollout saving skill tasks datamodules.collect datamodules.relabel datamodules.relabelling datamodules.sources",
-    "dds_lightning.sharing": "agent errors saving tasks training",
-    "dds_lightning.pipeline": "agent baselines configs console errors policy rollout saving skill study tasks training "
-    "datamodules.collect datamodules.inspection datamodules.relabelled datamodules.relabelling datamodules.relabel "
+    "dds_lightning.study": "agent callbacks console errors interpret.atlas interpret.draw interpret.measure online "
+    "policy rollout saving skill tasks datamodules.collect datamodules.relabel datamodules.relabelling "
     "datamodules.sources",
-    "dds_lightning.cli": "_version agent console errors interpret.draw pipeline policy saving sharing skill study "
-    "tasks training datamodules.collect datamodules.inspection datamodules.listing datamodules.physics "
+    "dds_lightning.sharing": "agent errors saving tasks training",
+    "dds_lightning.pipeline": "agent baselines configs console errors interpret.draw online policy rollout saving "
+    "skill study tasks training datamodules.collect datamodules.inspection datamodules.relabelled "
+    "datamodules.relabelling datamodules.relabel datamodules.sources",
+    "dds_lightning.cli": "_version agent console errors interpret.draw online pipeline policy saving sharing skill "
+    "study tasks training datamodules.collect datamodules.inspection datamodules.listing datamodules.physics "
     "datamodules.relabel datamodules.relabelled datamodules.relabelling datamodules.sources",
     "dds_lightning.__main__": "cli",
 }

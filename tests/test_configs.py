@@ -42,7 +42,17 @@ def test_every_family_of_tasks_has_a_preset_and_so_has_the_paper():
             "skill.yaml",
             "policy.yaml",
             "clone.yaml",
+            "online.yaml",
         }
+
+
+def test_the_papers_online_settings_are_table_6():
+    """H, K and D are the skill model's; the rest is here."""
+    settings = settings_of("online", ["fit", "--config", "paper/online.yaml"])
+    model, data = settings["model"], settings["data"]
+    expected = {"lr": 3e-4, "temperature": 0.1, "target_ema": 0.005, "hidden_dims": [256, 256], "critics": 2}
+    assert {name: model[name] for name in expected} == expected
+    assert (data["gamma"], data["batch_size"]) == (0.99, 256)
 
 
 def test_the_papers_skill_settings_are_tables_4_to_6():

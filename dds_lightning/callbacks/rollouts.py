@@ -13,6 +13,8 @@ from dds_lightning.agent import AgentSelection, DDSAgent
 from dds_lightning.callbacks.resume import undisturbed
 from dds_lightning.envs.pool import EnvPool
 from dds_lightning.errors import UserError, refuse_seed
+from dds_lightning.online.parts import RawActions
+from dds_lightning.online.sac import SACModule
 from dds_lightning.policy import PolicyModule
 from dds_lightning.rollout.actors import Contestant, single_skills
 from dds_lightning.rollout.play import rollout
@@ -161,21 +163,23 @@ class RolloutEvaluation(Callback):
         if isinstance(pl_module, SkillModule):
             agent = DDSAgent(pl_module, None, "random", noise_scale=self.noise_scale)
             players = [Contestant("random", agent, self.episodes)]
-            if self.episodes_per_skill:
+            if self.episodes_per_skill and pl_module.discrete:
                 players.append(single_skills(agent, self.episodes_per_skill, "best_skill"))
             return players
-        if isinstance(pl_module, PolicyModule):
+        if isinstance(pl_module, (PolicyModule, SACModule)):
             agents = [
                 DDSAgent(self._skill_model(trainer, pl_module), pl_module, way, self.temperature, self.noise_scale)
                 for way in self.selections
             ]
             return [Contestant(agent.selection, agent, self.episodes) for agent in agents]
         raise UserError(
-            f"rollout evaluation knows SkillModule and PolicyModule, not {type(pl_module).__name__}: "
+            f"rollout evaluation knows SkillModule, PolicyModule and SACModule, not {type(pl_module).__name__}: "
             "override its `contestants`"
         )
 
-    def _skill_model(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> SkillModule:
+    def _skill_model(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> Any:
+        if isinstance(pl_module, SACModule) and pl_module.hparams.space == "raw":
+            return RawActions(pl_module)
         if self._skill is None:
             if self.skill_path is not None:
                 self._skill = SkillModule.load(self.skill_path)

@@ -21,7 +21,7 @@ from dds_lightning.saving.files import DISK_ERRORS, expand
 from dds_lightning.training.stages import STAGES
 
 USAGE_ERROR = 2
-GOES_ON = ("run", "relabel", "data collect", "data fetch")
+GOES_ON = ("run", "relabel", "online compare", "data collect", "data fetch")
 """Commands that detect what an earlier, interrupted call has already done."""
 
 
@@ -64,7 +64,7 @@ def _dispatch(arguments: list[str]) -> int:
         print(f"dds-lightning {__version__}")
         return 0
     try:
-        if arguments and arguments[0] in STAGES:
+        if arguments and arguments[0] in STAGES and arguments[1:2] != ["compare"]:
             from dds_lightning.training.options import help_of, refuse_typos
 
             if (text := help_of(arguments[0], arguments[1:])) is not None:

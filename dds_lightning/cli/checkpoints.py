@@ -27,7 +27,8 @@ def publish(
         run: A run of `dds run`, or a published directory; "-" with --skill.
         place: A new directory, or hf:OWNER/NAME.
         skill: Skill checkpoint (.ckpt) instead of a run.
-        policy: Policy checkpoint (.ckpt) to go with it.
+        policy: Policy checkpoint (.ckpt) to go with it, of `dds policy fit` or `dds online fit`; one over raw actions
+            comes without --skill.
         task: Name of the task to keep with it; without it the one that the run or the checkpoints were trained for.
         card: A text file for README.md; without it the run's card.
         public: Make a new repository on the Hub public.
@@ -42,13 +43,14 @@ def publish(
     from dds_lightning.study.loose import loose_agent, loose_task
     from dds_lightning.tasks import facts_to_keep, get_task, restore_task
 
-    if (run == "-") != (skill is not None):
-        raise UserError(f"run is '{run}' and --skill is {skill}: give a run, or - and --skill CHECKPOINT")
-    if policy is not None and skill is None:
+    parts = skill is not None or policy is not None
+    if policy is not None and skill is None and run != "-":
         raise UserError(f"--policy is {policy} without --skill: give both")
+    if (run == "-") != parts:
+        raise UserError(f"run is '{run}' and --skill is {skill}: give a run, or - and --skill CHECKPOINT")
     chosen = None if task is None else get_task(task)
     text = None if card is None else _text(card)
-    if skill is not None:
+    if parts:
         agent, chosen = loose_agent(skill, policy), loose_task(task, policy, skill)
         about, metrics = {"task": None} if chosen is None else facts_to_keep(chosen), None
     else:

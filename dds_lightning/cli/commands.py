@@ -30,7 +30,7 @@ def run(
     temperature: float | None = None,
     noise_scale: float | None = None,
     workers: int | None = None,
-    until: Literal["data", "skill", "relabel", "policy", "clone", "examine", "evaluate", "report"] = "report",
+    until: Literal["data", "skill", "relabel", "policy", "clone", "examine", "evaluate", "report", "online"] = "report",
     fresh: bool = False,
     **stages: list[str],
 ) -> Report:
@@ -70,7 +70,7 @@ def run(
         temperature: Temperature of `sample`; below 1 is nearer to greedy.
         noise_scale: Factor on the decoder's noise when acting; without it the preset's or the skill model's.
         workers: Number of processes for the environments; without it one per core.
-        until: The last stage to do.
+        until: The last stage to do; online, after the report, goes on in the environment itself.
         fresh: Do every stage again.
         **stages: Settings for `dds STAGE fit` of each training stage, see above.
     """

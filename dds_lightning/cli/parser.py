@@ -8,7 +8,7 @@ from typing import Any, Literal
 import docstring_parser
 from jsonargparse import ArgumentParser
 
-from dds_lightning.cli import atlas, checkpoints, commands, data, record
+from dds_lightning.cli import atlas, checkpoints, commands, data, online, record
 from dds_lightning.cli.completion import script
 from dds_lightning.console.arguments import as_lists, list_options
 from dds_lightning.console.reports import Report
@@ -20,6 +20,7 @@ Commands = Mapping[str, Any]  # name -> function, a group of commands, or None f
 GROUPS = {
     "data": "List, show, check, fetch and collect data sets.",
     "checkpoints": "List and verify published agents.",
+    "online": STAGES["online"].description,
 }
 OPTIONAL_POSITIONALS: dict[Callable[..., Any], tuple[str, str]] = {
     commands.tasks: ("name", "?"),
@@ -37,6 +38,7 @@ def command_table() -> Commands:
     return {
         "run": commands.run,
         **dict.fromkeys(STAGES),
+        "online": {"compare": online.compare},  # beside the stage's own `fit`
         "relabel": commands.relabel,
         "evaluate": commands.evaluate,
         "report": commands.report,

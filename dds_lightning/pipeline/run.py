@@ -85,7 +85,7 @@ def _report(run: Run) -> Report:
         marker, remedy = run.done["report"].folder / MARKER, "delete it, and `dds run` reports again"
         with parsing(marker, remedy) if run.done["report"].skipped else nullcontext():
             text += summary_lines(run.facts("report"))
-        shown = [run.done["report"]]
+        shown = [run.done[name] for name in ("report", "online") if name in run.done]
         text.append(f"agent: {run.output('evaluate', 'agent')}")
     text += [f"{name}: {path}" for step in shown for name, path in step.outputs.items()]
     total = sum(step.seconds for step in done)

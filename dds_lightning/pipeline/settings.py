@@ -180,9 +180,11 @@ class Trainings:
         arguments = ["fit", *(["--config", str(config)] if config else [])]
         arguments += [f"--seed_everything={wanted.seed}", f"--data.seed={wanted.seed}"]
         arguments += [f"--data.task={self.task_address}", f"--data.data={spec}"]
-        if stage == "policy":
+        if stage in ("policy", "online"):
             checkpoint = skill or wanted.out / "skill" / "last.ckpt"
-            arguments += [f"--data.skill={checkpoint}", f"--data.cache={wanted.out / 'relabel'}", *self._watching()]
+            arguments += [f"--data.skill={checkpoint}", f"--data.cache={wanted.out / 'relabel'}"]
+        if stage == "policy":
+            arguments += self._watching()
         if stage == "clone":
             steps = wanted.clone_steps
             arguments += [f"--trainer.max_steps={steps}", f"--trainer.val_check_interval={min(1000, steps)}"]

@@ -2,7 +2,7 @@
 
 ```
  data ─► skill ─► relabel ─► policy ─┬─► evaluate ─► report
-   └──────────► clone (baseline) ────┴─► examine ──┘
+   └──────────► clone (baseline) ────┴─► examine ──┘ └─► online, with `--until online`
 ```
 
 A new step is one more row of `STEPS`. A step may run as soon as those that it reads are done.
@@ -95,7 +95,9 @@ def _data(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
 # ---------------------------------------------------------------------- trainings
 
 
-def training_step(stage: str, reads: tuple[str, ...], title: Callable[[Run, Settings], str], best: str = "") -> Step:
+def training_step(
+    stage: str, reads: tuple[str, ...], title: Callable[[Run, Settings], str], best: str = "", publish: bool = False
+) -> Step:
     """The step that trains a stage.
 
     Args:
@@ -104,20 +106,21 @@ def training_step(stage: str, reads: tuple[str, ...], title: Callable[[Run, Sett
         title: From the run and the training's settings.
         best: What a best checkpoint is, where one was kept: "replaces" the last one for the steps that follow, or is
             told "beside" it.
+        publish: Whether the trained policy and its skills become an agent of their own in the step's folder.
     """
     return Step(
         stage,
         reads,
         lambda run: title(run, run.trainings.settings(stage)),
         lambda run: run.trainings.cache_key_settings(stage),
-        partial(_fit, stage, best),
+        partial(_fit, stage, best, publish),
         lambda run: run.trainings.former_settings(stage),
     )
 
 
-def _fit(stage: str, best: str, run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
+def _fit(stage: str, best: str, publish: bool, run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
     """Run `dds STAGE fit`, from its last checkpoint if there is one."""
-    skill = run.output("skill", "checkpoint") if stage == "policy" else None
+    skill = run.output("skill", "checkpoint") if stage in ("policy", "online") else None
     last = folder / "last.ckpt"
     resume = last if resuming and last.is_file() else None
     run.say(run.trainings.command(stage, run.data_spec, skill, resume), style="dim")
@@ -128,6 +131,12 @@ def _fit(stage: str, best: str, run: Run, folder: Path, resuming: bool) -> Mappi
     elif "best" in made:
         made["chosen"] = protocol.best_facts(made["checkpoint"], made["best"])
     metrics = {name: round(value, 6) for name, value in fitted["metrics"].items()}
+    if publish:
+        from dds_lightning.agent import DDSAgent
+        from dds_lightning.online.parts import checkpoint_parts
+
+        agent = DDSAgent(*checkpoint_parts(str(skill), str(made["checkpoint"])), seed=run.wanted.seed)
+        made["agent"] = agent.save(folder / "agent", **facts_to_keep(run.task))
     return {**made, "steps": fitted["steps"], "metrics": metrics}
 
 
@@ -319,6 +328,12 @@ STEPS: dict[str, Step] = {
             lambda run: "report: table, figures, clip",
             lambda run: {"task": run.task.name},
             _write_report,
+        ),
+        training_step(
+            "online",
+            ("data", "skill", "relabel"),
+            lambda run, settings: f"online: SAC over the skills, {settings['trainer']['max_steps']:,} steps",
+            publish=True,
         ),
     )
 }

@@ -104,8 +104,9 @@ class AgentGroup:
             own = rows[part] - self._starts[i]
             codes.append(agent.choose(x[part], restarted[part], own))
             chosen.append(agent.decided[own])
-        in_use = np.concatenate(codes)
-        return Acted(lead.decode(x, in_use), in_use, np.concatenate(chosen))
+        in_use = np.concatenate(codes)  # (n,) codes, or (n, D) continuous skills, which have no number to note
+        acted = lead.decode(x, in_use)
+        return Acted(acted, in_use, np.concatenate(chosen)) if in_use.ndim == 1 else Acted(acted)
 
 
 @dataclass(frozen=True)

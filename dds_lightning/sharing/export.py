@@ -59,6 +59,8 @@ class ActingGraph(nn.Module):
                 f"selection is '{agent.selection}': an exported agent chooses by its policy; load it with "
                 "selection sample, greedy or argmax_q"
             )
+        if not agent.skill.discrete:
+            raise UserError("the agent's choices are numbers, not codes: an exported file chooses among codes")
         self.skill, self.policy = agent.skill, agent.policy
         self.by_q, self.temperature = agent.selection == "argmax_q", agent.temperature
         self.noise_scale = agent.noise_scale

@@ -68,7 +68,9 @@ def _verified(published: Published, classes: Mapping[str, type[nn.Module]]) -> d
         "num_skills": None,
         "golden": None,
     }
-    if "skill" not in modules:
+    online: Any = modules.get("online")
+    raw = online is not None and online.hparams.space == "raw"
+    if "skill" not in modules and not raw:
         return facts
     modules.clear()  # the agent has its own
     agent = DDSAgent.load(directory)

@@ -7,27 +7,25 @@ from typing import Any
 
 from dds_lightning.agent import DDSAgent
 from dds_lightning.errors import UserError
-from dds_lightning.policy import PolicyModule
+from dds_lightning.online.parts import checkpoint_parts
 from dds_lightning.saving.checkpoint import load_ckpt, stage_of, trained_for
 from dds_lightning.saving.published import load_published
-from dds_lightning.skill import SkillModule
 from dds_lightning.tasks import Task, get_task, known_task, restore_task
 from dds_lightning.tasks.own import is_address
 
 
-def loose_agent(skill: str, policy: str | None = None, **acting: Any) -> DDSAgent:
+def loose_agent(skill: str | None, policy: str | None = None, **acting: Any) -> DDSAgent:
     """Put a skill checkpoint and a policy checkpoint together.
 
     Args:
-        skill: A `.ckpt` or a published directory.
-        policy: Likewise; None for an agent that chooses its skills at random.
+        skill: A `.ckpt` or a published directory; None for raw actions.
+        policy: Likewise, offline or online; None for an agent that chooses its skills at random.
         **acting: Settings of the agent.
 
     Raises:
         UserError: A file cannot be read, or the two do not belong together.
     """
-    chooser = None if policy is None else PolicyModule.load(policy)
-    return DDSAgent(SkillModule.load(skill), chooser, "random" if chooser is None else "sample", **acting)
+    return DDSAgent(*checkpoint_parts(skill, policy), "random" if policy is None else "sample", **acting)
 
 
 def loose_task(asked: str | None, *checkpoints: str | None) -> Task | None:

@@ -54,7 +54,7 @@ def protocol(
         "seed": seed,
         "checkpoint": checkpoint,
         "noise_scale": agent.noise_scale,
-        "sampler": settings["sampler"] if settings["decoder"] == "diffusion" else None,
+        "sampler": settings["sampler"] if settings.get("decoder") == "diffusion" else None,
         "temperature": temperature,
         "horizon": agent.horizon,
         "max_episode_steps": task.max_episode_steps,

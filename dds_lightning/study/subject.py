@@ -118,6 +118,8 @@ def atlas(
 
     announce("looking at the checkpoint")
     subject = find_subject(place, seed, task)
+    if not subject.agent.discrete:
+        raise UserError(f"{place} has no codes: an atlas shows discrete skills; look at this agent with `dds evaluate`")
     spec, name = data or subject.data, task or subject.task
     if spec is None:
         raise UserError(f"{place} does not know its data: give --data, for example local:DIR, minari:ID or d4rl:FILE")

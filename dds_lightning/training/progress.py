@@ -27,7 +27,10 @@ class StepProgress(ProgressBar):
 
     def __init__(
         self,
-        metrics: tuple[str, ...] = ("train/loss", "val/loss", "val/codes_used", "rollout/success"),
+        metrics: tuple[str, ...] = (
+            *("train/loss", "val/loss", "val/codes_used", "rollout/success"),
+            *("online/env_steps", "online/return", "online/success"),
+        ),
         log_every_n_seconds: float = 60.0,
     ) -> None:
         super().__init__()

@@ -91,6 +91,17 @@ STAGES: dict[str, Stage] = {
             preset="clone.yaml",
             threads=1,  # more gain little on an idle machine and cost much on a busy one
         ),
+        Stage(
+            name="online",
+            description="Online RL with trained skills: SAC over codes, continuous skills or raw actions.",
+            module="dds_lightning.online.sac:SACModule",
+            data="datamodules.online:OnlineDataModule",
+            links=("observation_dim", "space", "choices", "prior_unknown", "skill_hash"),
+            steps=100_000,
+            widths="model.hidden_dims or data.replay_size",
+            preset="online.yaml",
+            threads=1,
+        ),
     )
 }
 """Name -> stage, in the order of the method."""

@@ -294,11 +294,23 @@ def test_what_an_earlier_version_finished_is_still_done(finished, capsys, tmp_pa
 
 
 def test_the_steps_come_after_what_they_read_and_are_those_that_until_takes():
-    assert list(STEPS) == STAGES
+    assert list(STEPS) == [*STAGES, "online"]
     for index, step in enumerate(STEPS.values()):
         assert set(step.reads) <= set(STAGES[:index])
     until = inspect.signature(commands.run).parameters["until"].annotation
-    assert list(get_args(until)) == STAGES
+    assert list(get_args(until)) == list(STEPS)
+
+
+def test_a_finished_run_goes_on_online_with_its_data_and_skills(finished, capsys):
+    words = ["--out", finished, *SMALL, "--until=online", "--online.trainer.max_steps=3", "--online.data.num_envs=2"]
+    words += ["--online.data.random_steps=20", "--online.data.batch_size=16", "--online.trainer.accelerator=cpu"]
+    status, said, _ = call(capsys, *words)
+    assert status == 0
+    assert said["done_before"] == STAGES
+    agent = DDSAgent.load(said["outputs"]["online"]["agent"])
+    assert agent.policy.STAGE == "online"
+    assert agent.skill.fingerprint() == DDSAgent.load(finished / "agent").skill.fingerprint()
+    assert call(capsys, *words)[1]["done_before"] == [*STAGES, "online"]
 
 
 @pytest.mark.parametrize("every", [-1, 21])

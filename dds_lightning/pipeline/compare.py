@@ -1,0 +1,194 @@
+"""`dds online compare`: the same task learned online over codes, continuous skills and raw actions, seed by seed.
+
+Every training is a `dds online fit` in a folder of its own and is done once; a comparison that was stopped goes on.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from rich.console import Console
+
+from dds_lightning.agent import DDSAgent
+from dds_lightning.console.reports import Report, table
+from dds_lightning.errors import UserError
+from dds_lightning.interpret.draw.online import plot_comparison
+from dds_lightning.online.parts import checkpoint_parts
+from dds_lightning.rollout.actors import Contestant
+from dds_lightning.rollout.play import rollout
+from dds_lightning.saving.files import sha256
+from dds_lightning.saving.run_directory import Done, RunDirectory, locked, write_json
+from dds_lightning.tasks import facts_to_keep, get_task
+from dds_lightning.training.stage_cli import command, settings_of
+
+CURVE = {
+    "online/env_steps": "env_steps",
+    "online/success": "success",
+    "online/return": "return",
+    "online/cells": "cells",
+}
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What `dds online compare` was asked to do; see its help."""
+
+    task: str
+    out: Path
+    skill: str | None = None
+    gaussian: str | None = None
+    data: str | None = None
+    policy: str | None = None
+    seeds: int = 3
+    env_steps: int = 150_000
+    episodes: int = 20
+    workers: int | None = None
+    config: str = "online.yaml"
+    arguments: tuple[str, ...] = ()
+
+    def variants(self) -> dict[str, list[str]]:
+        """The variants whose files were given: name to arguments of `dds online fit`."""
+        units = [f"--data.skill={self.skill}"] if self.skill else []
+        found: dict[str, list[str]] = {"raw actions": [*units, "--data.actions=raw"]}
+        if self.gaussian:
+            found = {"continuous skills": [f"--data.skill={self.gaussian}"], **found}
+        if self.skill:
+            found = {"discrete skills": units, **found}
+        if self.skill and self.data:
+            prior = [*units, f"--data.data={self.data}", f"--data.cache={self.out / 'relabel'}"]
+            found["discrete skills, prior data"] = prior
+            if self.policy:
+                found["offline to online"] = [*prior, f"--model.offline={self.policy}"]
+        return found
+
+
+def compare(asked: Comparison) -> Report:
+    """Train every variant with every seed, play the agents, and write one table and one figure.
+
+    Raises:
+        UserError: A setting or a file does not fit, found before the first training.
+    """
+    for name, value in (("seeds", asked.seeds), ("episodes", asked.episodes)):
+        if value < 1:
+            raise UserError(f"--{name} is {value}, expected at least 1")
+    task = get_task(asked.task)
+    variants = asked.variants()
+    prepared = {name: _arguments(asked, more) for name, more in variants.items()}
+    with locked(asked.out):
+        directory = RunDirectory(asked.out, Console(stderr=True))
+        done = {
+            (name, seed): directory.do(
+                f"{name.replace(', ', '-').replace(' ', '-')}/{seed}",
+                f"{name}, seed {seed}",
+                _settings(asked, prepared[name]),
+                [],
+                partial(_train, asked, name, seed, prepared[name]),
+            )
+            for name in variants
+            for seed in range(asked.seeds)
+        }
+        rows = _table(variants, asked.seeds, done)
+        rows.to_csv(asked.out / "table.csv", index=False)
+        curves = {key: pd.read_csv(one.outputs["curve"]) for key, one in done.items()}
+        visits = {key: np.load(one.outputs["visits"]) for key, one in done.items()}
+        figure = asked.out / "comparison.png"
+        plot_comparison(task, curves, visits).savefig(figure, dpi=150)
+    left = [f"--{name}" for name in ("skill", "gaussian", "data", "policy") if getattr(asked, name) is None]
+    notes = [f"not given, so not compared: {', '.join(left)}"] if left else []
+    data = {"task": task.name, "out": asked.out, "env_steps": asked.env_steps, "table": rows, "figure": figure}
+    return Report(data, [table(rows), *notes, f"figure: {figure}"])
+
+
+def _arguments(asked: Comparison, more: Sequence[str]) -> list[str]:
+    """The arguments of a variant's `dds online fit`, seed and places aside; its steps follow from `env_steps`."""
+    arguments = ["fit", "--config", asked.config, f"--data.task={asked.task}", *more, *asked.arguments]
+    data = settings_of("online", arguments)["data"]
+    steps = int(data["updates"] * (asked.env_steps - data["random_steps"]))
+    if steps < 1:
+        raise UserError(
+            f"--env_steps is {asked.env_steps}, expected more than data.random_steps {data['random_steps']}"
+        )
+    return [*arguments, f"--trainer.max_steps={steps}"]
+
+
+def _settings(asked: Comparison, arguments: Sequence[str]) -> dict[str, Any]:
+    """What a training's result depends on: its settings, and what the files hold instead of where they are."""
+    config = settings_of("online", arguments)
+    files = {name: _content(getattr(asked, name)) for name in ("skill", "gaussian", "policy")}
+    data = {name: value for name, value in config["data"].items() if name not in ("skill", "cache", "seed")}
+    model = {name: value for name, value in config["model"].items() if name != "offline"}
+    return {
+        "model": model,
+        "data": data,
+        "steps": config["trainer"]["max_steps"],
+        "files": files,
+        "play": asked.episodes,
+    }
+
+
+def _content(path: str | None) -> str | None:
+    """Hash of a checkpoint's weights."""
+    if path is None:
+        return None
+    place = Path(path)
+    file = place / "model.safetensors" if place.is_dir() else place
+    return sha256(file) if file.is_file() else None
+
+
+def _train(
+    asked: Comparison, name: str, seed: int, prepared: Sequence[str], folder: Path, resuming: bool
+) -> Mapping[str, Any]:
+    """One training, its curve, its map, and how its agent plays."""
+    last = folder / "last.ckpt"
+    arguments = [*prepared, f"--seed_everything={seed}", f"--trainer.default_root_dir={folder}"]
+    arguments += [f"--checkpoint.dirpath={folder}", "--trainer.enable_model_summary=false"]
+    if resuming and last.is_file():
+        arguments = [one for one in arguments if not one.startswith("--model.offline")] + [f"--ckpt_path={last}"]
+    command("online", arguments)()
+    curve = pd.concat(pd.read_csv(path) for path in sorted(folder.glob("logs/version_*/metrics.csv")))
+    curve = curve.drop_duplicates("step", keep="last").sort_values("step")
+    curve = curve[[name for name in CURVE if name in curve]].rename(columns=CURVE).dropna(subset="env_steps")
+    curve.to_csv(folder / "curve.csv", index=False)
+    visits = torch.load(last, weights_only=True)["loops"]["fit_loop"]["state_dict"]["combined_loader"][0]["collector"]
+    np.save(folder / "visits.npy", visits["visits"].numpy())
+    task = get_task(asked.task)
+    skill = None if name == "raw actions" else asked.gaussian if name == "continuous skills" else asked.skill
+    agent = DDSAgent(*checkpoint_parts(skill, str(last)), seed=seed)
+    result = rollout(task, [Contestant(name, agent, asked.episodes)], seed=seed, workers=asked.workers)
+    (played,) = json.loads(result.summary().to_json(orient="records"))
+    metrics = {"episodes": asked.episodes, "seed": seed, "results": [played]}
+    place = agent.save(folder / "agent", metrics=metrics, **facts_to_keep(task))
+    write_json(folder / "played.json", played)
+    collected = curve.iloc[-1].to_dict()
+    facts = {"played": played, "collected": {key: float(value) for key, value in collected.items()}}
+    return {"curve": folder / "curve.csv", "visits": folder / "visits.npy", "agent": place, **facts}
+
+
+def _table(variants: Mapping[str, Any], seeds: int, done: Mapping[tuple[str, int], Done]) -> pd.DataFrame:
+    """One row a variant: means over seeds, with the standard deviation of what agents reach when they play."""
+    rows = []
+    for name in variants:
+        facts = [done[name, seed].facts for seed in range(seeds)]
+        played = pd.DataFrame([fact["played"] for fact in facts])
+        collected = pd.DataFrame([fact["collected"] for fact in facts])
+        measure = "score" if played["success"].isna().all() else "success"
+        rows.append(
+            {
+                "variant": name,
+                "seeds": seeds,
+                "env_steps": int(collected["env_steps"].mean()),
+                measure: played[measure].astype(float).mean(),
+                "std": float(played[measure].astype(float).std(ddof=0)),
+                "while learning": collected["success" if measure == "success" else "return"].mean(),
+                "cells": collected["cells"].mean() if "cells" in collected else float("nan"),
+            }
+        )
+    return pd.DataFrame(rows)

@@ -1,0 +1,62 @@
+"""Optimistic labels: the reward that was learned where one has been, and a bonus where one has not."""
+
+import pytest
+import torch
+
+from dds_lightning.online.novelty import Novelty
+from dds_lightning.online.sac import SACModule
+
+
+@pytest.fixture(scope="module")
+def trained():
+    """Trained on states in [0, 1]: the reward is the first number, the end is where the second is above 0.5."""
+    torch.manual_seed(0)
+    novelty = Novelty(2, [64, 64])
+    optimizer = torch.optim.Adam([p for p in novelty.parameters() if p.requires_grad], lr=3e-3)
+    for _ in range(600):
+        x = torch.rand(128, 2)
+        loss = novelty.loss(x, x[:, 0], (x[:, 1] > 0.5).float())
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    return novelty.eval()
+
+
+def test_rewards_and_terminations_are_learned(trained):
+    x = torch.tensor([[0.2, 0.1], [0.8, 0.9], [0.5, 0.2], [0.3, 0.8]])
+    reward, end = trained.label(x, optimism=0.0)
+    assert torch.allclose(reward, x[:, 0], atol=0.05)
+    assert end.tolist() == [0, 1, 0, 1]
+
+
+def test_the_bonus_is_near_zero_where_one_was_and_large_where_not(trained):
+    near, far = torch.rand(200, 2), 3.0 + torch.rand(200, 2)
+    bonus = [(trained.label(x, 1.0)[0] - trained.label(x, 0.0)[0]) for x in (near, far)]
+    assert bonus[0].mean() < 0.05
+    assert bonus[1].mean() > 10 * bonus[0].mean()
+    twice = trained.label(far, 2.0)[0] - trained.label(far, 0.0)[0]
+    assert torch.allclose(twice, 2 * bonus[1], rtol=1e-4)
+
+
+def test_the_random_network_never_changes(trained):
+    assert all(not weights.requires_grad for weights in trained.random.parameters())
+
+
+def test_unknown_rewards_are_replaced_and_known_ones_are_not():
+    torch.manual_seed(0)
+    module = SACModule(3, "discrete", 4, hidden_dims=[8], prior_unknown=True, optimism=0.5)
+    batch = {"observations": torch.randn(6, 3), "actions": torch.randint(4, (6,)), "rewards": torch.full((6,), 9.0)}
+    batch |= {"next_observations": torch.randn(6, 3), "discounts": torch.ones(6), "dones": torch.ones(6)}
+    batch["known"] = torch.arange(6) < 3
+    module.train()
+    _, terms = module.loss(batch)
+    assert terms["novelty_loss"] > 0
+    rewards, dones = module._labelled(batch, module.embed(batch["observations"]))
+    assert rewards[:3].tolist() == [9.0] * 3
+    assert (rewards[3:] < 3).all()
+    assert dones[:3].tolist() == [1.0] * 3
+    changed = {**batch, "rewards": torch.where(batch["known"], batch["rewards"], -100.0)}
+    torch.manual_seed(1)
+    same = module.loss(changed)[1]["q_loss"]
+    torch.manual_seed(1)
+    assert same == module.loss(batch)[1]["q_loss"]

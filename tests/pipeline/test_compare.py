@@ -1,0 +1,52 @@
+"""`dds online compare`: a row for each variant, one figure, and nothing done twice."""
+
+import pandas as pd
+import pytest
+
+from dds_lightning.interpret.draw.online import on_one_grid
+from tests.fits import TASK, of_data, skill_of, told
+
+TINY = ["--data.batch_size=16", "--data.random_steps=60", "--data.num_envs=2", "--data.updates=0.1"]
+TINY += ["--model.hidden_dims=[16]", "--trainer.log_every_n_steps=2", "--trainer.enable_progress_bar=false"]
+
+
+@pytest.mark.slow
+def test_variants_are_trained_once_and_compared(dds, tmp_path):
+    data = of_data(tmp_path / "data")
+    discrete = skill_of(data, tmp_path / "discrete", 1)
+    gaussian = skill_of(data, tmp_path / "gaussian", 1, "--model.bottleneck=gaussian")
+    (spec,) = [word.partition("=")[2] for word in data if word.startswith("--data.data=")]
+    words = ["online", "compare", TASK, "--skill", discrete, "--gaussian", gaussian, "--data", spec, "--seeds=2"]
+    words += ["--env_steps=700", "--episodes=1", "--workers=0", "--out", tmp_path / "out", "--json"]
+    words += [f"--set+={word}" for word in TINY]
+    answer = dds(*words)
+    assert answer.status == 0, answer.err
+    variants = ["discrete skills", "continuous skills", "raw actions", "discrete skills, prior data"]
+    assert [row["variant"] for row in answer.json["table"]] == variants
+    for row in answer.json["table"]:
+        assert row["seeds"] == 2
+        assert 600 <= row["env_steps"] <= 800
+        assert 0 <= row["success"] <= 100
+        assert row["cells"] >= 1
+    assert (tmp_path / "out" / "comparison.png").stat().st_size > 10_000
+    assert (tmp_path / "out" / "raw-actions" / "1" / "agent" / "model.safetensors").is_file()
+    (tmp_path / "out" / "raw-actions" / "1" / "curve.csv").unlink()
+    again = dds(*words)
+    assert again.json["table"] == answer.json["table"]
+    assert again.err.count("done before") == 7
+
+
+def test_too_few_steps_are_refused_before_anything_is_made(dds, tmp_path):
+    answer = dds("online", "compare", TASK, "--env_steps=10", "--out", tmp_path / "out")
+    assert answer.status == 2
+    assert "--env_steps is 10, expected more than data.random_steps 4000" in told(answer.err)
+    assert not (tmp_path / "out").exists()
+
+
+def test_curves_are_compared_where_every_seed_has_a_value():
+    one = pd.DataFrame({"env_steps": [0, 100, 200], "success": [0.0, 10.0, 20.0]})
+    two = pd.DataFrame({"env_steps": [50, 150], "success": [50.0, 50.0]})
+    steps, values = on_one_grid([one, two], "success")
+    assert (steps[0], steps[-1]) == (50, 150)
+    assert values[:, 0].tolist() == pytest.approx([5.0, 50.0])
+    assert values[:, -1].tolist() == pytest.approx([15.0, 50.0])
