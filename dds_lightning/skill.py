@@ -342,11 +342,8 @@ class SkillModule(StageModule):
         """Warn where most of the codebook is idle."""
         used = int(self.bottleneck.health().get("codes_used", self.num_skills))
         if 2 * used < self.num_skills:
-            warnings.warn(
-                f"only {used} of {self.num_skills} codes are in use: the policy can choose among no more. Keep "
-                "codebook_init=kmeans and restart_threshold above 0, lower lr, or ask for fewer skills",
-                stacklevel=1,
-            )
+            remedy = "Keep codebook_init=kmeans and restart_threshold above 0, lower lr, or ask for fewer skills"
+            warnings.warn(f"only {used} of {self.num_skills} codes are in use. {remedy}", stacklevel=1)
 
     def predict_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """Codes (B,) of a batch of segments."""
