@@ -12,9 +12,14 @@ def list_options(function: Callable[..., Any], prefix: str = "") -> set[str]:
     return {
         f"--{prefix}{name}"
         for name, parameter in inspect.signature(function).parameters.items()
-        if str(parameter.annotation).removeprefix("collections.abc.").startswith(("list[", "Sequence["))
-        and "|" not in str(parameter.annotation)
+        if takes_lists(parameter.annotation)
     }
+
+
+def takes_lists(annotation: Any) -> bool:
+    """Whether a type takes nothing but lists."""
+    text = str(annotation).removeprefix("collections.abc.")
+    return text.startswith(("list[", "Sequence[")) and "|" not in text
 
 
 def as_lists(arguments: Sequence[str], options: Collection[str]) -> list[str]:

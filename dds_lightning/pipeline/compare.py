@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import torch
 from rich.console import Console
 
 from dds_lightning.agent import DDSAgent
@@ -24,8 +23,11 @@ from dds_lightning.interpret.draw.online import plot_comparison
 from dds_lightning.online.parts import checkpoint_parts
 from dds_lightning.rollout.actors import Contestant
 from dds_lightning.rollout.play import rollout
+from dds_lightning.saving.arrays import read_npy
+from dds_lightning.saving.checkpoint import load_ckpt
 from dds_lightning.saving.files import sha256
 from dds_lightning.saving.run_directory import Done, RunDirectory, locked, write_json
+from dds_lightning.saving.untrusted import read_csv
 from dds_lightning.tasks import facts_to_keep, get_task
 from dds_lightning.training.stage_cli import command, settings_of
 
@@ -97,8 +99,8 @@ def compare(asked: Comparison) -> Report:
         }
         rows = _table(variants, asked.seeds, done)
         rows.to_csv(asked.out / "table.csv", index=False)
-        curves = {key: pd.read_csv(one.outputs["curve"]) for key, one in done.items()}
-        visits = {key: np.load(one.outputs["visits"]) for key, one in done.items()}
+        curves = {key: read_csv(one.outputs["curve"], {"env_steps": "iuf"}) for key, one in done.items()}
+        visits = {key: read_npy(one.outputs["visits"]) for key, one in done.items()}
         figure = asked.out / "comparison.png"
         plot_comparison(task, curves, visits).savefig(figure, dpi=150)
     left = [f"--{name}" for name in ("skill", "gaussian", "data", "policy") if getattr(asked, name) is None]
@@ -153,11 +155,11 @@ def _train(
     if resuming and last.is_file():
         arguments = [one for one in arguments if not one.startswith("--model.offline")] + [f"--ckpt_path={last}"]
     command("online", arguments)()
-    curve = pd.concat(pd.read_csv(path) for path in sorted(folder.glob("logs/version_*/metrics.csv")))
+    curve = pd.concat(read_csv(path, {"step": "iuf"}) for path in sorted(folder.glob("logs/version_*/metrics.csv")))
     curve = curve.drop_duplicates("step", keep="last").sort_values("step")
     curve = curve[[name for name in CURVE if name in curve]].rename(columns=CURVE).dropna(subset="env_steps")
     curve.to_csv(folder / "curve.csv", index=False)
-    visits = torch.load(last, weights_only=True)["loops"]["fit_loop"]["state_dict"]["combined_loader"][0]["collector"]
+    visits = load_ckpt(last)["loops"]["fit_loop"]["state_dict"]["combined_loader"][0]["collector"]
     np.save(folder / "visits.npy", visits["visits"].numpy())
     task = get_task(asked.task)
     skill = None if name == "raw actions" else asked.gaussian if name == "continuous skills" else asked.skill

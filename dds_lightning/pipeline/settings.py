@@ -122,6 +122,8 @@ class Trainings:
     def _asked_interval(self) -> int:
         """The interval that was asked for; by default 1 stands for one to be settled, and none on PointMaze."""
         every = self.wanted.evaluate_every
+        if every is not None and every < 0:
+            raise UserError(f"--evaluate_every is {every}, expected 0 (never) or more")
         return (0 if self.task.family == "pointmaze" else 1) if every is None else every
 
     def _settle_interval(self) -> None:
@@ -130,7 +132,7 @@ class Trainings:
         steps, every = settings.trainer.max_steps, self.evaluate_every
         if self.wanted.evaluate_every is None and every:
             every = max(1, steps // 4) if steps > 0 else 0
-        elif every < 0 or 0 < steps < every:
+        elif 0 < steps < every:
             raise UserError(f"--evaluate_every is {every}, expected 0 (never) to {steps}, the steps of the policy")
         if every != self.evaluate_every:
             watching = self._watching_callback(settings)

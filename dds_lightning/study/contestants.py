@@ -41,7 +41,7 @@ def way(
         best: Facts of the checkpoint (see `protocol.best_facts`), if it is not the last one; its name says so.
     """
     name = way_name(selection, temperature) + (f" ({best_label(best)})" if best else "")
-    if getattr(agent.policy, "STAGE", None) == "online":
+    if getattr(getattr(agent, "policy", None), "STAGE", None) == "online":
         name = name.replace("AWR", "SAC")
     return Contestant(name, agent.variant(selection, temperature=temperature), episodes)  # type: ignore[arg-type]
 

@@ -1,6 +1,5 @@
 """A training in a process of its own, for strategies that start the command they are in once more on every device."""
 
-import json
 import os
 import signal
 import subprocess
@@ -11,6 +10,7 @@ from pathlib import Path
 from dds_lightning.console import interrupts
 from dds_lightning.console.reports import Report
 from dds_lightning.errors import ToldAlreadyError
+from dds_lightning.saving.untrusted import mapping, parse_json
 
 
 def run_alone(arguments: Sequence[str]) -> Report:
@@ -41,7 +41,7 @@ def run_alone(arguments: Sequence[str]) -> Report:
         except interrupts.Interrupted as stop:
             process.send_signal(stop.signum)
     if process.returncode == 0:
-        made = json.loads(answer)
+        made = mapping(parse_json(answer, "the answer of the training"), "the answer of the training")
         return Report({**made, **{name: Path(made[name]) for name in ("checkpoint", "best") if made[name]}})
     if process.returncode == 2:
         raise ToldAlreadyError(f"dds {arguments[0]} has said what was wrong")

@@ -11,12 +11,13 @@ import typing
 from collections.abc import Iterator, Sequence
 from typing import Any, Literal, NamedTuple
 
-import yaml
 from jsonargparse import ArgumentError, ArgumentParser
 
 from dds_lightning.configs import resolve_configs
+from dds_lightning.console.arguments import takes_lists
 from dds_lightning.console.refusals import did_you_mean, sentence
 from dds_lightning.errors import UserError
+from dds_lightning.saving.untrusted import read_yaml
 from dds_lightning.training.source import Parameter, parameters_of, summary_of
 from dds_lightning.training.stages import Stage, get_stage
 
@@ -181,9 +182,8 @@ def _given(arguments: Sequence[str]) -> Iterator[tuple[str, str | None]]:
 
 def _of_file(path: str) -> Iterator[tuple[str, None]]:
     try:
-        with open(path, encoding="utf-8") as file:
-            settings = yaml.safe_load(file)
-    except (OSError, ValueError, yaml.YAMLError):
+        settings = read_yaml(path)
+    except UserError:
         return  # the parser says what is wrong with it
     for group, inner in settings.items() if isinstance(settings, dict) else ():
         if isinstance(inner, dict):
@@ -205,6 +205,8 @@ def _known(option: str, known: dict[str, Parameter]) -> str | None:
 def _refuse_value(option: str, value: str, one: Parameter, where: str) -> None:
     if one.annotation is inspect.Parameter.empty:
         return
+    if takes_lists(one.annotation) and not value.lstrip().startswith("["):
+        value = f"[{value}]"
     parser = ArgumentParser(exit_on_error=False)
     parser.add_argument(f"--{option}", type=one.annotation)
     try:

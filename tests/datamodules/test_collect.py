@@ -268,7 +268,7 @@ def test_progress_counts_steps_on_standard_error(tmp_path: Path, capfd: pytest.C
     [
         ({"steps": 0}, "steps: got 0"),
         ({"workers": 0}, "workers: got 0"),
-        ({"seed": -1}, "seed: got -1"),
+        ({"seed": -1}, "seed is -1, expected a whole number"),
         ({"speed": 6.0}, "speed: got 6.0"),
         ({"waypoint_offset": 0.5}, "waypoint_offset: got 0.5, expected 0 to 0.4"),
         ({"start_offset": -0.1}, "start_offset: got -0.1"),

@@ -166,7 +166,7 @@ def test_the_navigator_reaches_the_goal() -> None:
         ({"task": "pointmaze-umaze-play"}, "cannot be collected here, expected a task of antmaze in d4rl physics"),
         ({"task": "antmaze-umaze@robotics"}, "cannot be collected here, expected a task of antmaze in d4rl physics"),
         ({"steps": 0}, "steps: got 0"),
-        ({"seed": -1}, "seed: got -1"),
+        ({"seed": -1}, "seed is -1, expected a whole number"),
         ({"workers": 0}, "workers: got 0"),
     ],
 )

@@ -163,7 +163,7 @@ def test_recorded_rewards_can_be_kept(minari_set: Write) -> None:
 def test_saved_arrays_are_a_source_too(minari_set: Write, tmp_path: Path) -> None:
     data = load_trajectories(f"local:{minari_set()}", LARGE)
     data.save(tmp_path / "arrays")
-    back = load_trajectories(f"arrays:{tmp_path / 'arrays'}", LARGE)
+    back = load_trajectories(f"arrays:{tmp_path / 'arrays'}")
     assert back.fingerprint() == data.fingerprint()
     data.select([0]).save(tmp_path / "one")
     narrow = np.zeros((13, 3), np.float32)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dds_lightning.training import stage_cli
+from dds_lightning.training import precision
 from dds_lightning.training.precision import Choice, fastest_precision
 from dds_lightning.training.stage_cli import StageCLI
 from tests.fits import QUIET, SKILL, call, of_data, told
@@ -27,7 +27,7 @@ def test_the_measurement_gives_one_of_two_precisions_and_draws_nothing():
     ],
 )
 def test_a_measured_precision_is_used_unless_one_is_given(words, used, monkeypatch, tmp_path, data):
-    monkeypatch.setattr(stage_cli, "fastest_precision", lambda use_gpu: Choice("bf16-mixed", 2.0))
+    monkeypatch.setattr(precision, "fastest_precision", lambda use_gpu: Choice("bf16-mixed", 2.0))
     made = StageCLI("skill", ["fit", *words, *data, *SKILL, *QUIET, f"--trainer.default_root_dir={tmp_path}"]).build()
     assert made.trainer.precision == used
 
@@ -41,10 +41,10 @@ def test_a_training_goes_on_in_the_precision_that_it_began_with(monkeypatch, tmp
     """On another machine the measurement may say something else."""
     common = ["skill", "fit", "--precision=auto", *data, *SKILL, *QUIET, f"--checkpoint.dirpath={tmp_path}"]
     common.append(f"--trainer.default_root_dir={tmp_path}")
-    monkeypatch.setattr(stage_cli, "fastest_precision", lambda use_gpu: Choice("bf16-mixed", 2.0))
+    monkeypatch.setattr(precision, "fastest_precision", lambda use_gpu: Choice("bf16-mixed", 2.0))
     assert call(*common, "--trainer.max_steps=2") == 0
     assert "precision: bf16-mixed (bfloat16 is 2.0 times as fast as float32 here)" in capsys.readouterr().err
-    monkeypatch.setattr(stage_cli, "fastest_precision", lambda use_gpu: Choice("32-true", 0.5))
+    monkeypatch.setattr(precision, "fastest_precision", lambda use_gpu: Choice("32-true", 0.5))
     resumed = [*common[1:], f"--ckpt_path={tmp_path}/last.ckpt", "--trainer.max_steps=4"]
     assert StageCLI("skill", resumed).build().trainer.precision == "bf16-mixed"
     assert call("skill", *resumed, "--trainer.precision=32-true") == 2

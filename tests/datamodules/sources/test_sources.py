@@ -51,7 +51,7 @@ def toy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 
 def test_a_new_source_is_one_record(toy: str, tmp_path: Path) -> None:
     task = get_task(TASK)
-    loaded = load_trajectories(toy, task, reward="recorded")
+    loaded = load_trajectories(toy)
     assert loaded.fingerprint() == toy_trajectories().fingerprint()
     assert resolve_task(toy, TASK) == task
     with pytest.raises(UserError, match=r"recorded in PointMaze_UMaze-v3.*needs PointMaze_Large-v3"):
