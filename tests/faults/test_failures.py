@@ -96,7 +96,7 @@ def test_a_policy_out_of_memory_says_what_to_lower(capsys, monkeypatch, data, sk
     error = told(capsys.readouterr().err)
     assert "out of memory at step 0 with data.batch_size 32 and horizon 5 (CUDA out of memory)" in error
     assert error.endswith("lower data.batch_size first, then model.hidden_dims")  # nothing was saved yet
-    assert not Path("out").exists()
+    assert not list(Path("out").rglob("*"))
 
 
 def test_out_of_memory_anywhere_else_is_a_sentence_too(capsys, monkeypatch):

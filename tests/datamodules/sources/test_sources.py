@@ -23,8 +23,10 @@ TASK = "pointmaze-umaze-play"
 
 
 def toy_trajectories() -> Trajectories:
+    observations = np.arange(24.0).reshape(6, 4) / 100
+    observations[:, :2] += get_task(TASK).cell_to_xy([(1, 1)])
     episode = {
-        "observations": np.arange(24.0).reshape(6, 4),
+        "observations": observations,
         "actions": np.full((5, 2), 0.5),
         "rewards": np.arange(5.0),
         "terminations": np.zeros(5, bool),
@@ -59,7 +61,7 @@ def test_a_new_source_is_one_record(toy: str, tmp_path: Path) -> None:
     assert locate(toy) == tmp_path / "toys" / "one"
     assert stat_hash(toy) == stat_hash(f"arrays:{tmp_path}/toys/one")
     with open_recording(toy, task, np.random.default_rng(0)) as recording:
-        assert recording.states(0, 2, 4).tolist() == [[8, 9, 10, 11], [12, 13, 14, 15]]
+        assert recording.states(0, 2, 4).tolist() == toy_trajectories().observations[2:4].tolist()
         actions, rewards = recording.taken(0, 3, 5)
     assert actions.tolist() == [[0.5, 0.5]] * 2
     assert rewards.tolist() == [3, 4]
