@@ -148,7 +148,7 @@ class Codebook(Bottleneck):
 
     def health(self) -> Mapping[str, Tensor]:
         """Return ``perplexity`` and ``codes_used`` of the running usage; a code in use has a tenth of 1/K or more."""
-        in_use = self.usage >= 0.1 / self.num_skills
+        in_use = self.usage >= 0.1 * self.usage.sum() / self.num_skills  # a restart leaves the sum above 1
         return {"perplexity": perplexity(self.usage), "codes_used": in_use.sum().float()}
 
     @torch.no_grad()
