@@ -119,7 +119,7 @@ def _declared(file: Any, size: int, path: object) -> None:
     shape, _, dtype = read(file)
     if dtype.kind not in "biufU" or dtype.hasobject:
         raise UserError(f"{path} holds values of type {dtype}, expected numbers")
-    if math.prod(shape) * dtype.itemsize > size:
+    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize > size:  # older NumPy reads -1 as "all there is"
         raise UserError(f"{path} declares an array of shape {shape}, more than its {size:,} bytes hold")
 
 
