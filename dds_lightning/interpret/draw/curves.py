@@ -20,7 +20,7 @@ PANELS = {
     "policy": (
         ("train/v_mean", "mean V(s)"),
         ("train/q_loss", "TD error"),
-        ("train/effective_sample_size", "effective sample size of AWR"),
+        ("train/advantage_std", "spread of advantages"),
         ("val/code_accuracy", "agreement with the data's code"),
     ),
 }
