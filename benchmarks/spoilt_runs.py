@@ -81,7 +81,7 @@ class Bench:
         )
         transitions.prepare_data()
         transitions.setup()
-        shown = {**evidence.data_evidence(trajectories, self.task), **evidence.skill_evidence(skill)}
+        shown = {**evidence.data_evidence(trajectories, self.task), **evidence.skill_evidence(skills, skill)}
         return verdict(scores, {**shown, **evidence.policy_evidence(transitions, module)})
 
     def without_terminations(self) -> str:

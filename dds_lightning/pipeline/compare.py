@@ -84,13 +84,14 @@ def compare(asked: Comparison) -> Report:
     task = get_task(asked.task)
     variants = asked.variants()
     prepared = {name: _arguments(asked, more) for name, more in variants.items()}
+    settings = {name: _settings(asked, arguments) for name, arguments in prepared.items()}
     with locked(asked.out):
         directory = RunDirectory(asked.out, Console(stderr=True))
         done = {
             (name, seed): directory.do(
                 f"{name.replace(', ', '-').replace(' ', '-')}/{seed}",
                 f"{name}, seed {seed}",
-                _settings(asked, prepared[name]),
+                settings[name],
                 [],
                 partial(_train, asked, name, seed, prepared[name]),
             )

@@ -162,7 +162,6 @@ def _examine(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
     from datamodules.relabelled import RelabeledDataModule
     from dds_lightning.baselines.behaviour_cloning import BehaviourCloning
     from dds_lightning.policy import PolicyModule
-    from dds_lightning.skill import SkillModule
     from dds_lightning.study import evidence
 
     skill, wanted = run.output("skill", "checkpoint"), run.wanted
@@ -182,8 +181,8 @@ def _examine(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
     noise, recorded = wanted.noise_scale, data.trajectories
     return {
         **evidence.data_evidence(recorded, run.task),
-        **evidence.skill_evidence(skill),
-        **evidence.fidelity_evidence(recorded, SkillModule.load(skill), clone, noise, wanted.seed),
+        **evidence.skill_evidence(data.skill, skill),
+        **evidence.fidelity_evidence(recorded, data.skill, clone, noise, wanted.seed),
         **evidence.policy_evidence(data, PolicyModule.load(run.output("policy", "checkpoint"))),
     }
 

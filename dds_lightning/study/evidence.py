@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from datamodules.trajectories import Trajectories
     from dds_lightning.baselines.behaviour_cloning import BehaviourCloning
     from dds_lightning.policy import PolicyModule
+    from dds_lightning.skill import SkillModule
     from dds_lightning.tasks import Task
 
 EARLY = 0.9
@@ -40,8 +41,8 @@ def data_evidence(trajectories: Trajectories, task: Task) -> dict[str, Any]:
     }
 
 
-def skill_evidence(checkpoint: Path) -> dict[str, Any]:
-    """Return what a skill checkpoint says of its training.
+def skill_evidence(skill: SkillModule, checkpoint: Path) -> dict[str, Any]:
+    """Return what a skill model and the checkpoint that it is from say of its training.
 
     Returns:
         `codes_used` (codes with at least a tenth of the share 1/K, by the running usage), `num_skills`, and, where its
@@ -50,9 +51,7 @@ def skill_evidence(checkpoint: Path) -> dict[str, Any]:
     from dds_lightning.callbacks.best import callback_state
     from dds_lightning.callbacks.convergence import Convergence, expected_fall
     from dds_lightning.saving.checkpoint import load_ckpt
-    from dds_lightning.skill import SkillModule
 
-    skill = SkillModule.load(checkpoint)
     found: dict[str, Any] = {"num_skills": skill.num_skills}
     if skill.discrete:
         found["codes_used"] = int(skill.bottleneck.health()["codes_used"])
@@ -62,7 +61,7 @@ def skill_evidence(checkpoint: Path) -> dict[str, Any]:
 
 
 def fidelity_evidence(
-    trajectories: Trajectories, skill: Any, clone: BehaviourCloning, noise_scale: float | None, seed: int
+    trajectories: Trajectories, skill: SkillModule, clone: BehaviourCloning, noise_scale: float | None, seed: int
 ) -> dict[str, float]:
     """Return `fidelity` and `fidelity_clone`, errors of replays (see `interpret.measure.fidelity`); {} without them."""
     from dds_lightning.interpret.measure.fidelity import SKILLS, fidelity

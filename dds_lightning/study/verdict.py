@@ -53,13 +53,14 @@ def verdict(scores: Mapping[str, float], evidence: Mapping[str, float]) -> Verdi
         evidence: See `evidence`; what was not measured is left out and not asked.
     """
     agent, best = scores["agent"], scores.get("data_best", math.nan)
-    others = {
-        "the data's mean": scores.get("data_mean", math.nan),
-        "behaviour cloning": scores.get("clone", math.nan),
-        "one skill alone": scores.get("single", math.nan) - NEAR,
-        f"{100 * OF_THE_BEST:.0f} % of the data's best episode": OF_THE_BEST * best,
-    }
-    ahead = {name: score for name, score in others.items() if score > agent}
+    single = scores.get("single", math.nan)
+    references = [  # what it is called, its score, and the score from which the agent does not fall short of it
+        ("the data's mean", scores.get("data_mean", math.nan), scores.get("data_mean", math.nan)),
+        ("behaviour cloning", scores.get("clone", math.nan), scores.get("clone", math.nan)),
+        ("one skill alone", single, single - NEAR),
+        (f"{100 * OF_THE_BEST:.0f} % of the data's best episode", OF_THE_BEST * best, OF_THE_BEST * best),
+    ]
+    ahead = [reference for reference in references if reference[2] > agent]
     if not ahead:
         reached = f", the best episode of the data {best:.1f}" if best == best else ""
         return Verdict(None, f"Nothing to mend: the agent scores {agent:.1f}{reached}.")
@@ -94,8 +95,8 @@ def verdict(scores: Mapping[str, float], evidence: Mapping[str, float]) -> Verdi
             f"Policy: its choices are {what} ({100 * shift:.0f} % of the way from the data's policy to the critic's "
             f"best code): {how} --policy.model.alpha.",
         )
-    name, score = max(ahead.items(), key=lambda item: item[1])
-    text = f"Skills: the agent scores {agent:.1f}, {name} {score + (NEAR if 'alone' in name else 0.0):.1f}."
+    name, score, _ = max(ahead, key=lambda reference: reference[2])
+    text = f"Skills: the agent scores {agent:.1f}, {name} {score:.1f}."
     return Verdict("skill", f"{text} {_length(evidence)}Train them longer with --skill.trainer.max_steps.")
 
 
