@@ -1,19 +1,27 @@
-"""From offline to online: an online training that starts from the policy and the critics of `dds policy fit`."""
+"""From offline to online: an online training that starts from the policy and the critics of `dds policy fit`.
+
+A policy found by regression is a network, which is taken as it is. One in closed form, pi = beta exp(alpha A), is three
+networks that no gradient step could change together: the network of beta is taken, and taught to be pi in the states of
+the prior data.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from dds_lightning.errors import UserError
 from dds_lightning.policy import PolicyModule
 
 SHAPE = ("observation_dim", "hidden_dims", "fourier_features", "fourier_seen", "layer_norm")
+LESSONS, LESSON_SIZE, LESSON_RATE = 2_000, 512, 1e-3
+"""Steps, states in a step, and learning rate with which a policy in closed form becomes a network."""
 
 
 @torch.no_grad()
-def start_offline(module: Any, path: str) -> None:
+def start_offline(module: Any, path: str, states: Tensor | None = None) -> None:
     """Give an online module the normaliser, the features, the policy and the critics of an offline one.
 
     The two offline critics are dealt out where there are more.
@@ -21,9 +29,11 @@ def start_offline(module: Any, path: str) -> None:
     Args:
         module: A `SACModule` over the same codes.
         path: `.ckpt` or published directory of the policy.
+        states: (N, O) observations of the prior data, which a policy in closed form needs.
 
     Raises:
-        UserError: It is no policy, chooses among other codes, or has networks of another shape.
+        UserError: It is no policy, chooses among other codes, has networks of another shape, or is in closed form where
+            there are no prior data.
     """
     policy = PolicyModule.load(path)
     there, here = policy.hparams, module.hparams
@@ -39,8 +49,11 @@ def start_offline(module: Any, path: str) -> None:
     for name, (ours, theirs) in pairs.items():
         if ours != theirs:
             raise UserError(f"model.{name} is {ours}, but the policy in {path} has {theirs}: give the same")
-    if there.awr != "regression":
-        raise UserError(f"model.offline: the policy in {path} is in {there.awr}, expected awr: regression")
+    if there.awr == "closed_form" and states is None:
+        raise UserError(
+            f"model.offline: the policy in {path} is in closed form and becomes a network in the states of prior data: "
+            "give them with data.data, or a policy trained with --model.awr=regression"
+        )
     module.normaliser.load_state_dict(policy.normaliser.state_dict())
     module.features.load_state_dict(policy.features.state_dict())
     module.actor.net.load_state_dict(policy.actor.state_dict())
@@ -50,3 +63,26 @@ def start_offline(module: Any, path: str) -> None:
         for name, value in mine.state_dict().items():
             member = torch.arange(len(value)) % 2 if value.ndim == 3 else slice(None)  # layer norms are shared
             value.copy_(given[name][member])
+    if there.awr == "closed_form":
+        assert states is not None
+        _teach(module, policy, states)
+
+
+@torch.enable_grad()
+def _teach(module: Any, policy: PolicyModule, states: Tensor) -> None:
+    """Minimise KL(policy || actor) over the states (N, O), in an order of its own."""
+    policy.to(module.device)
+    optimiser = torch.optim.Adam(module.actor.parameters(), LESSON_RATE)
+    generator = torch.Generator().manual_seed(0)
+    for lesson in range(LESSONS):
+        for group in optimiser.param_groups:
+            group["lr"] = LESSON_RATE * (1.0 - lesson / LESSONS)
+        seen = states[torch.randint(len(states), (LESSON_SIZE,), generator=generator)].to(module.device)
+        with torch.no_grad():
+            taught = policy.logits(seen).softmax(dim=-1)  # (B, K)
+        learnt = module.logits(seen).log_softmax(dim=-1).masked_fill(~policy.support_mask, 0.0)
+        loss = -(taught * learnt).sum(dim=-1).mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    optimiser.zero_grad()

@@ -67,7 +67,8 @@ class SACModule(StageModule):
         lr_schedule: ``constant`` (the paper) or ``cosine`` decay to zero at ``max_steps``.
         init_from: ``.ckpt`` or published directory of an online training whose weights to start from.
         offline: ``.ckpt`` or published directory of an offline policy (`dds policy fit`) over the same codes: its
-            policy and its critics are where this training starts.
+            policy and its critics are where this training starts. One in closed form is taught to the actor in the
+            states of the prior data.
         optimism: Weight of the novelty in the rewards of prior data whose rewards are not known, in learning rewards.
         prior_unknown: Whether there are such data, linked from the data.
         skill_hash: Fingerprint of the skill model whose skills these are, linked from the data; null for raw actions.
@@ -305,7 +306,8 @@ class SACModule(StageModule):
             if not self.discrete:
                 self.action_box.fit(found["action_low"], found["action_high"])
             if self._offline is not None:
-                start_offline(self, self._offline)
+                prior = getattr(getattr(self.trainer, "datamodule", None), "prior", None)
+                start_offline(self, self._offline, None if prior is None else prior.observations)
 
     def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """One optimiser step's loss."""

@@ -213,11 +213,21 @@ def test_an_offline_policy_and_its_critics_are_where_it_starts(tmp_path, critics
     assert torch.allclose(module.q(x), policy.q(x), atol=1e-6)
 
 
+def test_a_policy_in_closed_form_becomes_a_network_in_the_states_of_the_data(tmp_path):
+    policy, path = offline(tmp_path, awr="closed_form", alpha=3.0, beta_floor=0.05)
+    module, states = module_of("discrete"), torch.randn(300, WIDTH)
+    start_offline(module, path, states)
+    there, here = policy.logits(states).softmax(-1), module.logits(states).softmax(-1)
+    assert 0.5 * (there - here).abs().sum(-1).mean() < 0.05  # total variation; 0.4 before
+    assert (there.argmax(-1) == here.argmax(-1)).float().mean() > 0.8  # several codes are nearly as good
+    assert not here[:, 0].any(), "a code without support became possible"
+
+
 @pytest.mark.parametrize(
     ("space", "theirs", "sentence"),
     [
         ("discrete", {"hidden_dims": [8]}, r"model.hidden_dims is \[16, 16\], but the policy in .* has \[8\]"),
-        ("discrete", {"awr": "closed_form"}, "is in closed_form, expected awr: regression"),
+        ("discrete", {"awr": "closed_form"}, "is in closed form and becomes a network in the states of prior data"),
         ("raw", {}, "a policy over codes, but the choices are raw: expected discrete"),
     ],
 )
