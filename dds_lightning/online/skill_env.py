@@ -28,7 +28,7 @@ BOUND = 2.5
 START, WHOLE = np.zeros(1, np.int64), 2**31
 
 
-class SkillEnv(gym.Wrapper[NDArray[np.float32], Any, NDArray[np.float32], Any]):
+class SkillEnv(gym.Wrapper[NDArray[np.float32], Any, NDArray[np.float32], Any], gym.utils.RecordConstructorArgs):
     """Any environment with flat observations, acted on by skills.
 
     The action is a code (`Discrete(K)`) where skills are discrete, a skill vector (`Box` of D numbers) where they
@@ -67,7 +67,18 @@ class SkillEnv(gym.Wrapper[NDArray[np.float32], Any, NDArray[np.float32], Any]):
         bound: float = BOUND,
     ) -> None:
         """Check that everything fits."""
-        super().__init__(env)
+        gym.utils.RecordConstructorArgs.__init__(
+            self,
+            _disable_deepcopy=True,  # the copies that `spec.make()` builds share the skill model
+            skill=skill,
+            gamma=gamma,
+            discount=discount,
+            reward_scale=reward_scale,
+            reward_shift=reward_shift,
+            noise_scale=noise_scale,
+            bound=bound,
+        )
+        gym.Wrapper.__init__(self, env)
         self.skill = None if skill is None else skill.eval()
         self.horizon = 1 if skill is None else int(skill.horizon)
         self.gamma, self.discount, self.noise_scale = gamma, discount, noise_scale

@@ -113,13 +113,15 @@ def compare(asked: Comparison) -> Report:
 def _arguments(asked: Comparison, more: Sequence[str]) -> list[str]:
     """The arguments of a variant's `dds online fit`, seed and places aside; its steps follow from `env_steps`."""
     arguments = ["fit", "--config", asked.config, f"--data.task={asked.task}", *more, *asked.arguments]
-    data = settings_of("online", arguments)["data"]
+    settings = settings_of("online", arguments)
+    data, logged = settings["data"], settings["trainer"]["log_every_n_steps"]
     steps = int(data["updates"] * (asked.env_steps - data["random_steps"]))
     if steps < 1:
         raise UserError(
             f"--env_steps is {asked.env_steps}, expected more than data.random_steps {data['random_steps']}"
         )
-    return [*arguments, f"--trainer.max_steps={steps}"]
+    often = max(1, min(logged, steps // 20))  # a curve needs points
+    return [*arguments, f"--trainer.max_steps={steps}", f"--trainer.log_every_n_steps={often}"]
 
 
 def _settings(asked: Comparison, arguments: Sequence[str]) -> dict[str, Any]:
@@ -190,8 +192,13 @@ def _table(variants: Mapping[str, Any], seeds: int, done: Mapping[tuple[str, int
                 "env_steps": int(collected["env_steps"].mean()),
                 measure: played[measure].astype(float).mean(),
                 "std": float(played[measure].astype(float).std(ddof=0)),
-                "while learning": collected["success" if measure == "success" else "return"].mean(),
-                "cells": collected["cells"].mean() if "cells" in collected else float("nan"),
+                "while learning": _mean(collected, "success" if measure == "success" else "return"),
+                "cells": _mean(collected, "cells"),
             }
         )
     return pd.DataFrame(rows)
+
+
+def _mean(collected: pd.DataFrame, name: str) -> float:
+    """Mean over seeds; NaN where it was not counted: not every task is a maze, not every training ended an episode."""
+    return float(collected[name].mean()) if name in collected else float("nan")

@@ -90,6 +90,18 @@ def test_gymnasiums_checker_accepts_it(bottleneck):
         check_env(env, skip_render_check=True)
 
 
+def test_an_environment_of_a_task_is_checked_and_made_anew_from_its_spec():
+    skill = skill_of(observation_dim=4, action_dim=2)
+    skill.action_box.fit(torch.full((2,), -1.0), torch.full((2,), 1.0))
+    env = SkillEnv(get_task("pointmaze-large-diverse").make_env(), skill, reward_shift=-1.0)
+    check_env(env, skip_render_check=True)
+    again = env.spec.make()
+    assert again.skill is skill and again.reward_shift == -1.0
+    for one in (env, again):
+        one.reset(seed=3)
+    assert np.array_equal(env.step(1)[0], again.step(1)[0])
+
+
 def test_the_same_seed_and_codes_give_the_same_episode():
     env = SkillEnv(Count(30), skill_of())
     seen = []
