@@ -3,7 +3,7 @@
 import hashlib
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal, Self
@@ -43,6 +43,7 @@ class StageModule(pl.LightningModule):
     normaliser: Normaliser
     action_box: ActionBox  # of modules that see actions
     init_from: str | None = None  # the checkpoint this module started from, in this process
+    _held: Mapping[str, Sequence[nn.Parameter]] = MappingProxyType({})  # submodules that stand still, and their weights
     terms: Mapping[str, Tensor] = MappingProxyType({})  # of the last training step; `FiniteGuard` names the bad ones
 
     def _refuse(self, rules: Sequence[tuple[str, bool, str]]) -> None:
@@ -86,7 +87,26 @@ class StageModule(pl.LightningModule):
     def frozen_modules(self) -> tuple[str, ...]:
         """Names of the submodules that do not learn; a Gaussian bottleneck has no weights and keeps drawing."""
         names = (name for part in self.PARTS if part not in self.trained_parts for name in self.PARTS[part])
-        return tuple(name for name in names if any(True for _ in getattr(self, name).parameters()))
+        return tuple(dict.fromkeys((*self._with_weights(names), *self._held)))
+
+    def _with_weights(self, names: Iterable[str]) -> list[str]:
+        return [name for name in names if any(True for _ in getattr(self, name).parameters())]
+
+    def hold(self, names: Sequence[str]) -> None:
+        """Let submodules stand still from now on; the others go on learning.
+
+        Args:
+            names: All that are held; what was held before and is not named learns again.
+        """
+        names = self._with_weights(names)
+        if names == list(self._held):
+            return
+        for parameter in (p for held in self._held.values() for p in held):
+            parameter.requires_grad_(True)
+        self._held = {name: [p for p in getattr(self, name).parameters() if p.requires_grad] for name in names}
+        for parameter in (p for held in self._held.values() for p in held):
+            parameter.requires_grad_(False)
+        self.train(self.training)
 
     def _begin(self, init_from: str | os.PathLike[str] | None) -> None:
         """Freeze what is not trained and load the weights to start from."""
@@ -153,6 +173,14 @@ class StageModule(pl.LightningModule):
             raise UserError(f"{type(datamodule).__name__}.statistics() lacks {', '.join(missing)}: return these too")
         return {name: statistics[name] for name in names}
 
+    def training_batches(self) -> Iterator[Any]:
+        """The training's first batches, from a loader of their own: reading them moves nothing in the training."""
+        datamodule: Any = getattr(self.trainer, "datamodule", None)
+        if datamodule is None:
+            self.trainer.fit_loop.setup_data()  # Lightning would make the loaders later
+        loader: Any = datamodule.train_dataloader() if datamodule else self.trainer.train_dataloader
+        return iter(loader)
+
     def fit_units(self) -> None:
         """Take the statistics of observations and actions from the data, unless a checkpoint brought them.
 
@@ -204,6 +232,7 @@ class StageModule(pl.LightningModule):
     def configure_optimizers(self) -> Any:
         """Adam over everything that learns together, with a learning rate for each part where `lr_scale` says so."""
         h = self.hparams
+        self.hold(())  # since a former training
         parameters: Any = self.parameters()
         if h.get("lr_scale"):
             parameters = [

@@ -70,7 +70,9 @@ class SkillModule(StageModule):
             ``init_from``, 0 keeps a policy that was trained on the old codes: codes that the new data do not use would
             restart too, and mean something else.
         restart_every: Steps between two searches for dead codes.
-        restart_until: Share of the training after which no code moves any more, so that the decoder can settle.
+        restart_until: Share of the training, or of `freeze_codes_after`, after which no code restarts any more.
+        freeze_codes_after: Optimiser step after which encoder and codebook stand still and the decoder alone learns,
+            at less than half the cost of a step; null lets all learn to the end (the paper).
         lr: Adam's learning rate.
         lr_schedule: ``constant`` (the paper) or ``cosine`` decay to zero at ``max_steps``.
         warmup_steps: Steps of linear warm-up.
@@ -120,6 +122,7 @@ class SkillModule(StageModule):
         restart_threshold: float = 0.1,
         restart_every: int = 100,
         restart_until: float = 0.7,
+        freeze_codes_after: int | None = None,
         lr: float = 5e-5,
         lr_schedule: Literal["constant", "cosine"] = "constant",
         warmup_steps: int = 0,
@@ -139,6 +142,7 @@ class SkillModule(StageModule):
             ("time_dim", time_dim % 2 == 0, "an even number: half sines, half cosines"),
             ("noise_scale", noise_scale >= 0, "0 or more"),
             ("dropout", 0 <= dropout < 1, "in [0, 1)"),
+            ("freeze_codes_after", freeze_codes_after is None or freeze_codes_after >= 1, "null or at least 1"),
             ("codebook_ema", codebook_ema is None or 0 < codebook_ema < 1, "null or in (0, 1)"),
             ("trainable", not only_codebook or bottleneck == "vq", "all: a gaussian bottleneck has no codebook"),
             ("trainable", not only_codebook or codebook_ema is None, "more, or codebook_ema: null to give it a loss"),
@@ -225,23 +229,21 @@ class SkillModule(StageModule):
         noise_scale: float | None = None,
         generator: torch.Generator | None = None,
     ) -> Tensor:
-        """Draw actions (B, A) for observations (B, O) under skills: codes (B,) or vectors (B, D)."""
-        return self.decode_vectors(observations, self.vectors(skills), noise_scale, generator)
+        """Draw actions (B, A), in the environment's units and inside its box.
+
+        Args:
+            observations: (B, O).
+            skills: Codes (B,) or vectors (B, D).
+            noise_scale: Factor on the decoder's noise; None takes the model's setting.
+            generator: Random stream; the global one by default.
+        """
+        scale = self.hparams.noise_scale if noise_scale is None else noise_scale
+        unit = self.decoder.sample(self.normaliser(observations), self.vectors(skills), scale, generator)
+        return self.action_box.from_unit(unit)
 
     def vectors(self, skills: Tensor) -> Tensor:
         """Skill vectors (B, D) of codes (B,); vectors are returned as they are."""
         return skills if skills.is_floating_point() else self.bottleneck.lookup(skills)
-
-    def decode_vectors(
-        self,
-        observations: Tensor,
-        vectors: Tensor,
-        noise_scale: float | None = None,
-        generator: torch.Generator | None = None,
-    ) -> Tensor:
-        """Draw actions (B, A), in the environment's units and inside its box, for skill vectors (B, D)."""
-        scale = self.hparams.noise_scale if noise_scale is None else noise_scale
-        return self.action_box.from_unit(self.decoder.sample(self.normaliser(observations), vectors, scale, generator))
 
     @property
     def draws(self) -> int:
@@ -257,29 +259,26 @@ class SkillModule(StageModule):
         """Take the data's statistics and start the bottleneck, unless a checkpoint brought both."""
         self.refuse_frozen_without_weights()
         self.fit_units()
-
-        def first() -> Tensor:
-            # A separate loader: reading data here must not move the training's position.
-            datamodule: Any = getattr(self.trainer, "datamodule", None)
-            if datamodule is None:
-                self.trainer.fit_loop.setup_data()  # Lightning would make the loaders after this
-            loader: Any = datamodule.train_dataloader() if datamodule else self.trainer.train_dataloader
-            return self._encodings_of(islice(iter(loader), START_BATCHES))
-
-        self.bottleneck.start(first)
+        self.bottleneck.start(lambda: self._encodings_of(islice(self.training_batches(), START_BATCHES)))
         self.agree(self.bottleneck)
+
+    def on_train_start(self) -> None:
+        """Freeze the codes again in a training that goes on."""
+        self._freeze_codes(self.global_step)
+
+    def _freeze_codes(self, step: int) -> None:
+        """Let the decoder alone learn from `freeze_codes_after` on."""
+        after = self.hparams.freeze_codes_after
+        self.hold(("encoder", "bottleneck") if after is not None and step >= after else ())
 
     @torch.no_grad()
     def _encodings_of(self, batches: Iterable[Batch]) -> Tensor:
         """Encoder outputs (N, D) of a few batches, in evaluation mode."""
-        was_training = self.training
+        was_training, there = self.training, self.device
         self.eval()
-        outputs = [
-            self._encodings(batch["observations"].to(self.device), batch["actions"].to(self.device))
-            for batch in batches
-        ]
+        found = [self._encodings(batch["observations"].to(there), batch["actions"].to(there)) for batch in batches]
         self.train(was_training)
-        return torch.cat(outputs)
+        return torch.cat(found)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """One optimiser step's loss."""
@@ -289,11 +288,13 @@ class SkillModule(StageModule):
         return total
 
     def after_step(self, step: int) -> None:
-        """Restart dead codes from this batch, until the codebook has to settle."""
+        """Restart dead codes from this batch until the codebook has to settle, and freeze them in time."""
         h = self.hparams
+        self._freeze_codes(step)
         if h.restart_threshold <= 0 or step % h.restart_every or "codebook" not in self.trained_parts:
             return
-        if self.trainer.max_steps > 0 and step > h.restart_until * self.trainer.max_steps:
+        last = h.freeze_codes_after or self.trainer.max_steps
+        if last > 0 and step > h.restart_until * last:
             return
         generator = torch.Generator().manual_seed(step)
         moved = self.bottleneck.revive(lambda: self._encodings_of([self._batch]), h.restart_threshold, generator)
@@ -308,9 +309,8 @@ class SkillModule(StageModule):
         """Log the loss, and update reconstruction error in action units (by sampling) and codebook usage."""
         total, terms, skill = self.loss(batch)
         observations, actions = batch["observations"], batch["actions"]
-        horizon = actions.shape[1]
-        vectors = skill.vectors.repeat_interleave(horizon, dim=0)  # (B H, D)
-        sampled = self.decode_vectors(observations.flatten(0, 1), vectors, noise_scale=1.0)
+        vectors = skill.vectors.repeat_interleave(actions.shape[1], dim=0)  # (B H, D)
+        sampled = self.decode(observations.flatten(0, 1), vectors, noise_scale=1.0)
         self.reconstruction_rmse.update((sampled - actions.flatten(0, 1)).square().mean(dim=-1))
         log = {f"{stage}/{name}": value for name, value in {"loss": total, **terms}.items()}
         self.log_dict(log, batch_size=len(actions), sync_dist=True)

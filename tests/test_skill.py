@@ -64,17 +64,10 @@ QUIET = {
 }
 
 
-def fit(module: SkillModule, steps: int, **settings) -> pl.Trainer:
-    trainer = pl.Trainer(
-        **QUIET,
-        max_steps=steps,
-        accelerator="cpu",
-        log_every_n_steps=10,
-        num_sanity_val_steps=0,
-        val_check_interval=steps,
-        **settings,
-    )
-    trainer.fit(module, Segments())
+def fit(module: SkillModule, steps: int, ckpt_path=None, **settings) -> pl.Trainer:
+    base = {"max_steps": steps, "accelerator": "cpu", "log_every_n_steps": 10, "num_sanity_val_steps": 0}
+    trainer = pl.Trainer(**(QUIET | base | {"val_check_interval": steps} | settings))
+    trainer.fit(module, Segments(), ckpt_path=ckpt_path, weights_only=True)
     return trainer
 
 
@@ -200,7 +193,7 @@ def test_a_continuous_model_has_no_codes():
     data = segments(2)
     with pytest.raises(UserError, match="no codes"):
         module.encode(data["observations"], data["actions"])
-    with pytest.raises(UserError, match="decode_vectors"):
+    with pytest.raises(UserError, match="give vectors"):
         module.decode(data["observations"][:, 0], torch.zeros(2, dtype=torch.long))
 
 

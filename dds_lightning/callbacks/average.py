@@ -15,7 +15,8 @@ class AverageWeights(WeightAveraging):
 
     With a constant learning rate the average is as good as the end of a decay, so a training need not know
     beforehand when it ends. A checkpoint's `state_dict` is the average; what a resumed training needs lies beside it.
-    Buffers (statistics, usage of codes) are not averaged.
+    Buffers (statistics, usage of codes) are not averaged, nor are parts of the module that have stopped learning: an
+    average of codebook and encoder would lag behind both.
 
     Args:
         decay: Share of the average that a step keeps; the first steps keep less, (1 + n) / (10 + n) after n. Null
@@ -29,6 +30,7 @@ class AverageWeights(WeightAveraging):
         if decay is not None and not 0.0 < decay < 1.0:
             raise UserError(f"average.decay is {decay}, expected null or a number in (0, 1)")
         self.decay = decay
+        self._copied: tuple[str, ...] = ()  # parts whose average is what they are
         super().__init__(use_buffers=False, multi_avg_fn=self._average)
 
     def _average(self, averages: list[Tensor], weights: list[Tensor], count: Tensor | int) -> None:
@@ -36,6 +38,16 @@ class AverageWeights(WeightAveraging):
         assert self.decay is not None, "without a decay the callback is left out"
         keep = min(self.decay, (1.0 + float(count)) / (10.0 + float(count)))
         torch._foreach_lerp_(averages, weights, 1.0 - keep)
+
+    def on_train_batch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *args: Any, **kwargs: Any) -> None:
+        """Move the averages, and take the parts as they are that have just stopped learning."""
+        super().on_train_batch_end(trainer, pl_module, *args, **kwargs)
+        frozen = getattr(pl_module, "frozen_modules", ())
+        if frozen != self._copied and self._average_model is not None:
+            self._copied = frozen
+            averaged: Any = self._average_model.module
+            for name in frozen:
+                getattr(averaged, name).load_state_dict(getattr(pl_module, name).state_dict())
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Keep the weights apart: what is saved now must go on exactly, should it be trained longer."""

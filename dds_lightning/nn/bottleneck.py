@@ -56,7 +56,7 @@ class Bottleneck(nn.Module):
         Raises:
             UserError: Skills are continuous.
         """
-        raise UserError(f"{type(self).__name__} has continuous skills and no codes to decode: use decode_vectors")
+        raise UserError(f"{type(self).__name__} has continuous skills and no codes to decode: give vectors")
 
     def start(self, encodings: Callable[[], Tensor]) -> None:
         """Prepare for training, unless a checkpoint brought what is needed.

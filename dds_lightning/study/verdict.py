@@ -96,7 +96,7 @@ def verdict(scores: Mapping[str, float], evidence: Mapping[str, float]) -> Verdi
             f"best code): {how} --policy.model.alpha.",
         )
     name, score, _ = max(ahead, key=lambda reference: reference[2])
-    text = f"Skills: the agent scores {agent:.1f}, {name} {score:.1f}."
+    text = f"Skills: the agent scores {agent:.1f}; {name}: {score:.1f}."
     return Verdict("skill", f"{text} {_length(evidence)}Train them longer with --skill.trainer.max_steps.")
 
 

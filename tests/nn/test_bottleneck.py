@@ -47,7 +47,7 @@ def test_a_gaussian_draws_while_training_gives_its_mean_otherwise_and_has_nothin
     torch.testing.assert_close(drawn.std(dim=0), torch.ones(2), atol=0.05, rtol=0)
     space.start(never)
     assert space.revive(never, 0.5, torch.Generator()) == space.health() == {}
-    with pytest.raises(UserError, match="decode_vectors"):
+    with pytest.raises(UserError, match="give vectors"):
         space.lookup(torch.tensor([0]))
 
 

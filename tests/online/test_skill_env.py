@@ -96,7 +96,7 @@ def test_an_environment_of_a_task_is_checked_and_made_anew_from_its_spec():
     env = SkillEnv(get_task("pointmaze-large-diverse").make_env(), skill, reward_shift=-1.0)
     check_env(env, skip_render_check=True)
     again = env.spec.make()
-    assert again.skill is skill and again.reward_shift == -1.0
+    assert (again.skill, again.reward_shift) == (skill, -1.0)
     for one in (env, again):
         one.reset(seed=3)
     assert np.array_equal(env.step(1)[0], again.step(1)[0])

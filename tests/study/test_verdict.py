@@ -28,7 +28,7 @@ EVIDENCE = {
         ({"critic_rank": 0.05}, "policy", r"Critic: .* \(correlation 0.05, expected above 0.3\)"),
         ({"policy_shift": 0.0}, "policy", "the same as the data's .* raise --policy.model.alpha"),
         ({"policy_shift": 0.95}, "policy", "nearly always the critic's best .* lower --policy.model.alpha"),
-        ({}, "skill", "Skills: the agent scores 50.0, 90 % of the data's best episode 98.1. Not converged: held-out"),
+        ({}, "skill", "Skills: the agent scores 50.0; 90 % of the data's best episode: 98.1. Not converged: held-out"),
     ],
 )
 def test_the_first_stage_that_does_not_do_its_work_is_named(spoilt, stage, text):
@@ -45,6 +45,6 @@ def test_what_reaches_the_data_needs_no_mending_whatever_else_was_measured():
 def test_what_was_not_measured_is_not_asked():
     found = verdict({"agent": 10.0, "single": 30.0}, {})
     assert found.text == (
-        "Skills: the agent scores 10.0, one skill alone 30.0. Train them longer with --skill.trainer.max_steps."
+        "Skills: the agent scores 10.0; one skill alone: 30.0. Train them longer with --skill.trainer.max_steps."
     )
     assert verdict({"agent": 28.0, "single": 30.0}, {}).stage is None  # within chance

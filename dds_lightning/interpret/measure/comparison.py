@@ -52,7 +52,7 @@ class ClusteredSkills:
         generator: torch.Generator | None = None,
     ) -> Tensor:
         """Return actions (B, A) under the centres of codes (B,)."""
-        return self.skill.decode_vectors(observations, self.centres[codes], noise_scale, generator)
+        return self.skill.decode(observations, self.centres[codes], noise_scale, generator)
 
 
 @torch.no_grad()
@@ -132,7 +132,7 @@ def decoding_error(
             decoded = skill.decode(seen, held, 1.0, stream)
         else:
             found = model.encode_segments(observations, actions)
-            decoded = model.decode_vectors(seen, found.vectors.repeat_interleave(horizon, dim=0), 1.0, stream)
+            decoded = model.decode(seen, found.vectors.repeat_interleave(horizon, dim=0), 1.0, stream)
         squares.append((decoded - actions.flatten(0, 1)).square().mean(dim=-1))
     return float(torch.cat(squares).mean().sqrt())
 

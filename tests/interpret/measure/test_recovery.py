@@ -148,7 +148,7 @@ def test_continuous_skills_get_codes_by_the_nearest_centre(data):
     np.testing.assert_array_equal(codes, torch.cdist(means, skills.centres).argmin(dim=1))
     stream = [torch.Generator().manual_seed(0) for _ in range(2)]
     with torch.no_grad():
-        direct = skill.decode_vectors(observations[:, 0], skills.centres[codes], None, stream[0])
+        direct = skill.decode(observations[:, 0], skills.centres[codes], None, stream[0])
         torch.testing.assert_close(skills.decode(observations[:, 0], codes, None, stream[1]), direct)
 
 
