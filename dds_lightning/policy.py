@@ -74,6 +74,8 @@ class PolicyModule(StageModule):
             would find with infinite data (named departure from the paper); `alpha` may then change at any time.
         beta_floor: With ``closed_form``, codes to which the policy of the data gives less than this in a state are
             not chosen there: their Q was hardly learnt.
+        beta_ratio: The same for codes to which it gives less than this share of what it gives the likeliest code, as
+            discrete BCQ does (Fujimoto et al., 2019); 0 leaves none out, 1 all but that one.
         target_ema: Rate of the target network.
         extraction: ``after`` trains the critic for ``critic_steps``, then the policy on the frozen critic (the
             paper); ``joint`` trains them together.
@@ -118,6 +120,7 @@ class PolicyModule(StageModule):
         weight_clip: float = 100.0,
         awr: Solution = "regression",
         beta_floor: float = 0.01,
+        beta_ratio: float = 0.0,
         target_ema: float = 0.005,
         extraction: Literal["after", "joint"] = "after",
         critic_steps: int = 1_000_000,
@@ -144,6 +147,7 @@ class PolicyModule(StageModule):
             ("weight_clip", weight_clip > 0, "positive"),
             ("awr", awr in get_args(Solution), " or ".join(get_args(Solution))),
             ("beta_floor", 0 <= beta_floor < 1 / num_skills, f"in [0, 1/{num_skills})"),
+            ("beta_ratio", 0 <= beta_ratio <= 1, "in [0, 1]"),
             ("target_ema", 0 < target_ema <= 1, "in (0, 1]"),
             ("support", 0 <= support < 1 / num_skills, f"in [0, 1/{num_skills})"),
         ]
@@ -188,7 +192,8 @@ class PolicyModule(StageModule):
             return scores
         beta = scores.softmax(dim=-1)
         scores = scores + self.inverse_temperature * (self._target_q(features) - self.value(features))
-        return scores.masked_fill(beta < self.hparams.beta_floor, -torch.inf)
+        least = (self.hparams.beta_ratio * beta.amax(dim=-1, keepdim=True)).clamp_min(self.hparams.beta_floor)
+        return scores.masked_fill(beta < least, -torch.inf)
 
     def codes(
         self,
@@ -258,11 +263,9 @@ class PolicyModule(StageModule):
         if h.awr == "closed_form":
             return losses.awr(log_pi, torch.ones_like(log_pi)), {"clipped_share": log_pi.new_zeros(())}
         weights = losses.awr_weights((judged.q - judged.v).detach(), self.inverse_temperature, h.weight_clip)
-        statistics = {
-            "clipped_share": (weights >= h.weight_clip).float().mean(),
-            "effective_sample_size": losses.effective_sample_size(weights),
-        }
-        return losses.awr(log_pi, weights), statistics
+        clipped = (weights >= h.weight_clip).float().mean()
+        used = losses.effective_sample_size(weights)
+        return losses.awr(log_pi, weights), {"clipped_share": clipped, "effective_sample_size": used}
 
     def loss(self, batch: dict[str, Tensor]) -> Loss:
         """Sum of the losses that learn in this step; its terms and their statistics, detached."""
@@ -272,8 +275,7 @@ class PolicyModule(StageModule):
         v = self.value(features).squeeze(-1)  # (B,)
         judged = Judged(batch, features, q, v)
         terms = {"value_loss": self.value_loss, "q_loss": self.critic_loss} if "critic" in self.learning else {}
-        if "actor" in self.learning:
-            terms["actor_loss"] = self.actor_loss
+        terms |= {"actor_loss": self.actor_loss} if "actor" in self.learning else {}
         total = features.new_zeros(())
         info = {"v_mean": v.mean(), "v_min": v.min(), "v_max": v.max(), "q_mean": q.mean()}
         info["advantage_std"] = (q - v).std(correction=0)
@@ -331,10 +333,9 @@ class PolicyModule(StageModule):
     @torch.no_grad()
     def after_step(self, step: int) -> None:
         """Move the target critic towards the critic."""
-        target: list[Tensor] = list(self.target_critic.parameters())
-        online: list[Tensor] = list(self.critic.parameters())
         if "critic" in self.trained_parts:
-            torch._foreach_lerp_(target, online, self.hparams.target_ema)
+            weights: list[Tensor] = list(self.critic.parameters())
+            torch._foreach_lerp_(list(self.target_critic.parameters()), weights, self.hparams.target_ema)
 
     def evaluate(self, batch: dict[str, Tensor], stage: str) -> None:
         """Log the losses on held-out transitions, and how the policy compares with the data."""

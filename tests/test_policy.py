@@ -128,14 +128,23 @@ def test_the_closed_form_is_what_the_regression_tends_to(trained):
     assert data[:, :2] == pytest.approx(torch.full((4, 2), 0.5), abs=0.02)  # with alpha 0 the policy of the data
 
 
-def test_the_closed_form_leaves_out_what_the_data_hardly_do_there():
-    module = small(awr="closed_form", alpha=1.0, beta_floor=0.1)
+@pytest.mark.parametrize("settings", [{"beta_floor": 0.1}, {"beta_ratio": 0.2}, {"beta_floor": 0.1, "beta_ratio": 0.1}])
+def test_the_closed_form_leaves_out_what_the_data_hardly_do_there(settings):
+    module = small(awr="closed_form", alpha=1.0, **settings)
     with torch.no_grad():
         module.actor[-1].weight.zero_()
         module.actor[-1].bias.copy_(torch.tensor([0.55, 0.35, 0.09, 0.01]).log())
         probabilities = module.logits(torch.randn(50, 2)).softmax(dim=-1)
     assert (probabilities[:, :2] > 0).all()
     assert (probabilities[:, 2:] == 0).all()
+
+
+def test_only_the_likeliest_code_of_the_data_is_left_where_nothing_else_is_allowed():
+    module, states = small(awr="closed_form", alpha=50.0, beta_ratio=1.0), torch.randn(50, 2)
+    with torch.no_grad():
+        chosen = module.codes(states)
+        module.hparams.alpha = 0.0
+        assert torch.equal(chosen, module.logits(states).argmax(dim=-1))
 
 
 def test_codes_without_support_are_never_chosen():
