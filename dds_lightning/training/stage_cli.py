@@ -32,6 +32,7 @@ from dds_lightning.saving.files import short
 from dds_lightning.saving.untrusted import mapping, parse_yaml
 from dds_lightning.tasks.own import is_address
 from dds_lightning.training.fit import advice_on_memory, fit, quieten
+from dds_lightning.training.monitors import refuse_unlogged
 from dds_lightning.training.precision import OVERRULED, settle_precision
 from dds_lightning.training.resuming import (
     expand_paths,
@@ -202,8 +203,10 @@ class StageCLI(LightningCLI):
         Raises:
             UserError: They do not fit each other, or the checkpoint.
         """
-        if self.config.subcommand == "fit" and (requeued := requeued_checkpoint(self.settings)):
-            self.resume(requeued)
+        if self.config.subcommand == "fit":
+            refuse_unlogged(self.stage, self.settings)
+            if requeued := requeued_checkpoint(self.settings):
+                self.resume(requeued)
         self.measured_precision = settle_precision(self.settings)
         with as_user_errors(self.arguments):
             super()._set_seed()
@@ -231,6 +234,7 @@ class StageCLI(LightningCLI):
         Raises:
             UserError: Settings of the Trainer, a logger or a callback that cannot work.
         """
+        refuse_unlogged(self.stage, self.settings)
         with as_user_errors(self.arguments):
             return trial_trainer(self.settings.trainer)
 

@@ -24,6 +24,23 @@ LINES = [
     ("S --trainer.logger=WandbLoger", "did you mean WandbLogger?"),
     ("S --trainer.logger=CSVLogger", "CSVLogger needs save_dir: give --trainer.logger.save_dir=VALUE"),
     ("S --trainer.callbacks+=EarlyStopping", "EarlyStopping needs monitor"),
+    (
+        "S --trainer.callbacks+=EarlyStopping --trainer.callbacks.monitor=val_loss",
+        "monitor of EarlyStopping is val_loss, which the skill training never logs, expected one of train/codebook, ",
+    ),
+    ("S --trainer.callbacks+=ModelCheckpoint --trainer.callbacks.monitor=val/los", "did you mean val/loss?"),
+    ("S --best.monitor=val_loss", "did you mean val/loss?"),
+    ("S --best.monitor=val/loss --trainer.limit_val_batches=0", "best.monitor is val/loss, which"),
+    ("S --best.monitor=rollout/score", "which only a RolloutEvaluation logs: add --trainer.callbacks+="),
+    ("S --stop.when=converged --stop.monitor=loss", "stop.monitor is loss, which the skill training never logs"),
+    ("R --policy.stop.when=converged", "policy: stop.monitor is val/loss, which the policy training never logs"),
+    ("R --policy.best.monitor=val/reward", "policy: best.monitor is val/reward"),
+    ("R --clone.best.monitor=val/rmse", "clone: best.monitor is val/rmse"),
+    ("R --online.best.monitor=val/loss", "online: best.monitor is val/loss"),
+    (
+        "R --policy.trainer.check_val_every_n_epoch=1 --policy.trainer.val_check_interval=50000",
+        "policy: trainer.val_check_interval is 50000, but an epoch has at most",
+    ),
     ("S --trainer.callbacks+=EarlyStoping", "did you mean EarlyStopping?"),
     (
         "S --trainer.callbacks+=EarlyStopping --trainer.callbacks.moniter=x",
@@ -90,8 +107,6 @@ LINES = [
 ]
 LATE = [
     ("--trainer.val_check_interval=5000", "val_check_interval"),
-    ("--trainer.callbacks+=EarlyStopping --trainer.callbacks.monitor=val_loss --trainer.max_steps=60", "`val_loss`"),
-    ("--best.monitor=val_loss --trainer.max_steps=60", "monitor='val_loss'"),
 ]
 """What shows only when the training has begun."""
 
