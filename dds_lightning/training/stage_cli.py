@@ -64,9 +64,8 @@ class StageCLI(LightningCLI):
         self.arguments = as_lists(resolve_configs(arguments), options)
         self.checkpoint: dict[str, Any] | None = None
         self.measured_precision: str | None = None
-        parser = {"exit_on_error": False}
         try:
-            self._parse(parser)
+            self._parse({"exit_on_error": False})
         except ArgumentError as error:
             where = f"(see `dds {stage} {next(iter(arguments), 'fit')} --help`)"
             raise UserError(f"{sentence(error.message)} {where}") from None
