@@ -58,7 +58,7 @@ class TaskEnv(gym.Wrapper[Flat, Flat, Any, Any], gym.utils.RecordConstructorArgs
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (task.observation_dim,), np.float32)
 
     @property
-    def spec(self) -> EnvSpec | None:
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]  # an attribute of `Env`, a property of `Wrapper`
         """From which Gymnasium makes this environment again, also from JSON (`EnvSpec.from_json`)."""
         spec = super().spec
         if spec is not None:

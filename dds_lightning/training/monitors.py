@@ -34,7 +34,8 @@ def refuse_unlogged(stage: Stage, settings: Namespace) -> None:
         return
     logged = sorted(_logged(stage, settings, callbacks))
     for setting, metric in _watched(settings, callbacks):
-        if metric in logged or (metric in ALWAYS and not setting.startswith("stop.")):
+        # Where nothing is validated a training that would stop by `stop.monitor` ends at its steps.
+        if metric in logged or metric in (stage.metrics if setting == "stop.monitor" else ALWAYS):
             continue
         if metric.startswith("rollout/") and not any(name.startswith("rollout/") for name in logged):
             remedy = "which only a RolloutEvaluation logs: add --trainer.callbacks+=dds_lightning.callbacks."
@@ -86,7 +87,7 @@ def _watched(settings: Namespace, callbacks: list[Namespace]) -> Iterator[tuple[
 
 def _logged(stage: Stage, settings: Namespace, callbacks: list[Namespace]) -> set[str]:
     names = set(stage.metrics)
-    if settings.trainer.limit_val_batches == 0:
+    if settings.trainer.limit_val_batches == 0 or settings.data.get("validation_fraction") == 0:
         names = {name for name in names if not name.startswith("val/")}
     for callback in callbacks:
         kind = callback.class_path.rpartition(".")[2]

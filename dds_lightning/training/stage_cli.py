@@ -67,8 +67,8 @@ class StageCLI(LightningCLI):
         try:
             self._parse({"exit_on_error": False})
         except ArgumentError as error:
-            where = f"(see `dds {stage} {next(iter(arguments), 'fit')} --help`)"
-            raise UserError(f"{sentence(error.message)} {where}") from None
+            told, command = sentence(error.message), f"dds {stage} {next(iter(arguments), 'fit')} --help"
+            raise UserError(f"{told} (see `{command}{' trainer' * told.startswith('trainer')}`)") from None
 
     def _parse(self, parser: dict[str, Any]) -> None:
         """Let Lightning make its parser and parse."""
@@ -117,8 +117,9 @@ class StageCLI(LightningCLI):
         expand_paths(self.settings)
         data = self.settings.data
         refuse_seed("--seed_everything", int(self.settings.seed_everything))
-        if "seed" in data and data.seed is None:
-            data.seed = int(self.settings.seed_everything)
+        if "seed" in data:
+            data.seed = int(self.settings.seed_everything) if data.seed is None else data.seed
+            refuse_seed("data.seed", data.seed)
 
     @property
     def settings(self) -> Namespace:
@@ -159,7 +160,6 @@ class StageCLI(LightningCLI):
             settings.model.init_from = None  # a file of settings says how the training began that goes on here
         settings.ckpt_path = str(path)
         self.checkpoint = load_checkpoint(str(path), self.stage.name)
-        linked = {f"model.{name}" for name in self.stage.links}
         trained = {f"model.{name}": value for name, value in self.checkpoint["hyper_parameters"].items()}
         if self.config.subcommand == "fit":  # one may look at a model with other data
             trained |= self.checkpoint.get(TrainingSettings.KEY, {})
@@ -169,7 +169,7 @@ class StageCLI(LightningCLI):
             raise UserError(f"checkpoint {path} was trained for task {task}: give --data.task={task} again")
         refuse_conflicts(trained, chosen, path)
         for name, value in trained.items():
-            if name not in linked and name in settings:
+            if name.removeprefix("model.") not in self.stage.links and name in settings:
                 settings[name] = value
 
     def _take_shape(self, model: Namespace) -> None:
