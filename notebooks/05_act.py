@@ -491,14 +491,14 @@ plot_failures(yard, result, "argmax-Q")
 # Argmax-Q finds the way as well as the others, and then mostly ends *beside* the goal. As in D4RL, each episode draws
 # its own goal from the outlined area, and the agent does not know where it is: it has to search. The policy imitates
 # how the data search; the critic's maximum prefers skills that hardly occur there in the data (notebook 04). Random
-# skills never get that far.
+# skills hardly ever get that far.
 
 # %% [markdown]
 # ## How long does one action take?
 #
 # A robot cannot wait. Each point is the processor time of one call of `act`, the minimum of 60, on one thread
 # (other processes are not counted); the dashed line is the duration of one step of that robot. An action costs five
-# passes through a small network, whatever the robot; 64 robots at once cost about three times as much as one.
+# passes through a small network, whatever the robot; 64 robots at once cost about four to six times as much as one.
 
 # %%
 sizes = (1, 4, 16, 64)

@@ -14,7 +14,7 @@ from dds_lightning.interpret.draw.maze import plot_trajectories
 from dds_lightning.rollout.actors import Contestant, RandomActor
 from dds_lightning.rollout.play import rollout
 from dds_lightning.tasks import Task
-from tests.fits import POLICY, QUIET, call, skill_of
+from tests.fits import POLICY, QUIET, call, skill_of, told
 
 LENGTH, BOX = 40, 6.0
 
@@ -131,6 +131,81 @@ def test_arrays_without_a_task_train_an_agent_on_the_command_line(tmp_path):
     assert np.abs(actions).max() > 1.0  # volts, not the unit box
     played = rollout(RAIL, [Contestant("agent", agent, 2)], workers=0, progress=False)
     assert len(played.episodes["codes"].iloc[0]) == -(-played.episodes["length"].iloc[0] // agent.horizon)
+
+
+MODULE = """
+import gymnasium as gym
+import numpy as np
+
+LOW, HIGH = np.array([-2.0, 0.5], np.float32), np.array([1.0, 3.0], np.float32)
+
+
+class TwoArms(gym.Env):
+    observation_space, action_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32), gym.spaces.Box(LOW, HIGH)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = self.np_random.uniform(-1, 1, 2)
+        return self.x.astype(np.float32), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action), action
+        self.x = 0.8 * self.x + 0.1 * action
+        return self.x.astype(np.float32), -float(np.abs(self.x).sum()), False, False, {}
+
+
+gym.register("TwoArms-v0", entry_point="two_arms:TwoArms")
+"""
+
+
+@pytest.fixture
+def arms(tmp_path, monkeypatch):
+    """A task file whose environment is a module of one's own, with bounds that no single number describes."""
+    (tmp_path / "two_arms.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(tmp_path)
+    address = tmp_path / "arms.yaml"
+    address.write_text("env_id: two_arms:TwoArms-v0\nmax_episode_steps: 20\nscore_min: -60\nscore_max: 0\n")
+    yield str(address)
+    gym.registry.pop("TwoArms-v0", None)
+
+
+def test_an_environment_in_a_module_of_ones_own_with_a_box_of_its_own_goes_through_every_command(
+    tmp_path, arms, capsys, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    task, episodes, last = get_task(arms), [], np.arange(20) == 19
+    assert (task.action_low, task.action_high) == ((-2.0, 0.5), (1.0, 3.0))
+    env = task.make_env()
+    for number in range(8):
+        seen, taken, rewards = [env.reset(seed=number)[0]], [], []
+        for _ in range(20):
+            taken.append(env.action_space.sample())
+            observation, reward, *_ = env.step(taken[-1])
+            seen.append(observation)
+            rewards.append(reward)
+        fields = {"observations": seen, "actions": taken, "rewards": rewards}
+        episodes.append({**{key: np.stack(value) for key, value in fields.items()}, "terminations": last & False})
+        episodes[-1]["truncations"] = last
+    low, high = task.action_box()
+    Trajectories.from_episodes("arms", episodes, action_low=low, action_high=high).save(tmp_path / "data")
+    assert call("data", "check", "arrays:data", "--task", arms) == 0
+    words = [f"--data.task={arms}", "--data.data=arrays:data", "--data.validation_fraction=0.2"]
+    skill = skill_of(words, tmp_path / "skill", 3)
+    policy = ["policy", "fit", *words, *QUIET, *POLICY, f"--data.skill={skill}", "--trainer.max_steps=3"]
+    assert call(*policy, "--checkpoint.dirpath=policy", f"--trainer.default_root_dir={tmp_path}") == 0
+    parts = ["--skill", skill, "--policy", "policy/last.ckpt", "--task", arms]
+    assert call("evaluate", *parts, "--episodes", 2, "--workers", 1) == 0
+    assert call("publish", "-", "agent", *parts) == 0
+    assert call("checkpoints", "verify", "agent") == 0
+    assert call("evaluate", "agent", "--task", arms, "--episodes", 2, "--workers", 1) == 0
+    agent = DDSAgent.load("agent", seed=0)
+    actions = np.concatenate([agent.act(episode["observations"]) for episode in episodes])
+    assert ((actions >= low) & (actions <= high)).all()
+    assert (actions[:, 1] > 1.0).any()  # not in the unit box
+    capsys.readouterr()
+    monkeypatch.setattr("dds_lightning.tasks._OWN", {})
+    assert call("evaluate", "agent") == 2
+    assert "which imports code: if that is your own, name its task file with --task" in told(capsys.readouterr().err)
 
 
 def test_minari_sets_of_it_are_taken_without_an_environment_and_refused_with_a_way_out(tmp_path, monkeypatch):

@@ -27,8 +27,7 @@ def load_arrays(directory: str, task: Task | None) -> Trajectories:
     where = f"data set '{trajectories.name}'"
     check_width(where, task, trajectories.observation_dim, trajectories.action_dim)
     if task is not None:
-        low = np.full(trajectories.action_dim, task.action_low, np.float32)
-        high = np.full(trajectories.action_dim, task.action_high, np.float32)
+        low, high = task.action_box()
         for first in range(0, trajectories.num_steps, SLICE):
             in_box(f"{where}, actions", trajectories.actions[first : first + SLICE], low, high, first=first)
         refuse_other_task(where, trajectories.observations, task)

@@ -50,7 +50,7 @@ from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from datamodules.sources.fetch import find_d4rl
 from datamodules.sources.goal import cut_at_goal, ends_of
@@ -88,7 +88,7 @@ def load_d4rl(name: str, task: Task | None) -> Trajectories:
     """
     path = find_d4rl(name)
     where = f"data set '{path.name}'"
-    low, high = (task.action_low, task.action_high) if task else (-1.0, 1.0)
+    low, high = task.action_box() if task else (-1.0, 1.0)
     with open_hdf5(path, where) as file:
         rows = _read(file, where, task, low, high)
     if not (rows.last[:-1].any() or rows.terminals.any() or rows.timeouts.any()):
@@ -127,7 +127,7 @@ class _Rows:
 # ---------------------------------------------------------------------- from rows to episodes
 
 
-def _episodes(rows: _Rows, name: str, where: str, low: float, high: float) -> Trajectories:
+def _episodes(rows: _Rows, name: str, where: str, low: ArrayLike, high: ArrayLike) -> Trajectories:
     """Cut rows into episodes; see the pictures above.
 
     S states are laid out first: those of the rows, and after a `last` row one more where it is known or where the
@@ -172,7 +172,7 @@ def _episodes(rows: _Rows, name: str, where: str, low: float, high: float) -> Tr
 # ---------------------------------------------------------------------- reading rows
 
 
-def _read(file: h5py.File, where: str, task: Task | None, low: float, high: float) -> _Rows:
+def _read(file: h5py.File, where: str, task: Task | None, low: ArrayLike, high: ArrayLike) -> _Rows:
     fields = _fields(file, where, task)
     rewards = read_array(fields["rewards"], f"{where}, rewards").reshape(-1)
     terminals = _flags(fields["terminals"], f"{where}, terminals")
@@ -244,7 +244,7 @@ def _flags(dataset: h5py.Dataset, where: str) -> Flags:
     return array.astype(bool)
 
 
-def _numbers(dataset: h5py.Dataset, where: str, box: tuple[float, float] | None = None) -> Floats:
+def _numbers(dataset: h5py.Dataset, where: str, box: tuple[ArrayLike, ArrayLike] | None = None) -> Floats:
     """Finite float32 numbers, read and checked part by part directly into the result."""
     array = np.empty(dataset.shape, np.float32)
     low, high = (np.full(array.shape[1], bound, np.float32) for bound in box or (0, 0))

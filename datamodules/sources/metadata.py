@@ -31,6 +31,7 @@ from dds_lightning.errors import UserError
 from dds_lightning.saving.files import neighbours
 from dds_lightning.saving.untrusted import parse_json, read_text
 from dds_lightning.tasks import Task, is_own, known_env_ids
+from dds_lightning.tasks.task import bounds_text
 
 MAX_BYTES = 2**20
 """Greatest size of a metadata.json; genuine ones have a few thousand bytes."""
@@ -263,14 +264,11 @@ def action_box(metadata: dict[str, Any], task: Task | None) -> tuple[NDArray[np.
         raise DataError(f"{where} is {_short(space)}, expected a bounded Box")
     if task is None:
         return low, high
-    needed = (
-        np.full(task.action_dim, task.action_low, np.float32),
-        np.full(task.action_dim, task.action_high, np.float32),
-    )
+    needed = task.action_box()
     if low.shape != needed[0].shape or not np.allclose([low, high], needed):
         raise DataError(
-            f"{where} is a Box ({len(low)},) from {low.min():g} to {high.max():g}, but task '{task.name}' needs a Box "
-            f"({task.action_dim},) from {task.action_low:g} to {task.action_high:g}; {FIT}"
+            f"{where} is a Box ({len(low)},) from {bounds_text(low)} to {bounds_text(high)}, but task '{task.name}' "
+            f"needs a Box ({task.action_dim},) from {bounds_text(needed[0])} to {bounds_text(needed[1])}; {FIT}"
         )
     return needed
 

@@ -9,6 +9,8 @@ import lightning.pytorch as pl
 import torch
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 
+from dds_lightning.errors import UserError
+
 
 def callback_state(checkpoint: Mapping[str, Any], kind: type[Callback]) -> dict[str, Any] | None:
     """The state that a callback left in a Lightning checkpoint.
@@ -34,11 +36,16 @@ class BestCheckpoint(ModelCheckpoint):
         monitor: Name of the metric, e.g. `rollout/score`; null keeps none.
         mode: `max` or `min`.
         every_n_steps: Optimiser steps between two looks at the metric; null looks after validations.
+
+    Raises:
+        UserError: `every_n_steps` is less than 1.
     """
 
     def __init__(
         self, monitor: str | None = None, mode: Literal["max", "min"] = "max", every_n_steps: int | None = None
     ) -> None:
+        if every_n_steps is not None and every_n_steps < 1:
+            raise UserError(f"best.every_n_steps is {every_n_steps}, expected at least 1, or null for validations")
         super().__init__(
             filename="best",
             monitor=monitor,

@@ -24,6 +24,10 @@ from dds_lightning.skill import SkillModule
 from dds_lightning.tasks import Task, get_task
 
 
+def _measured(success: bool) -> list[str]:
+    return [*(["success"] if success else []), "score"]
+
+
 class RolloutEvaluation(Callback):
     """Play episodes now and then, and log how they went.
 
@@ -104,9 +108,6 @@ class RolloutEvaluation(Callback):
         self._evaluated_step = 0
         self._pool: EnvPool | None = None
         self._skill: SkillModule | None = None
-
-    RECORDS = False
-    """Whether the paths of the episodes are kept for `show`."""
 
     def show(self, trainer: pl.Trainer, result: RolloutResult) -> None:
         """Show what was played; called on the first process after each evaluation, for a subclass to use."""
@@ -206,12 +207,10 @@ class RolloutEvaluation(Callback):
         players = self.contestants(trainer, pl_module)
         if self._pool is None or self._pool.closed:
             self._pool = EnvPool(self.task, slots_needed(players, self.slots), self.workers)
-        result = rollout(
-            self.task, players, seed=self.seed, slots=self.slots, progress=False, pool=self._pool, record=self.RECORDS
-        )
+        result = rollout(self.task, players, seed=self.seed, slots=self.slots, progress=False, pool=self._pool)
         self.last = result
         self.show(trainer, result)
-        measured = [*(["success"] if self.task.measures_success else []), "score"]
+        measured = _measured(self.task.measures_success)
         values: dict[str, float] = {}
         for rank, row in enumerate(result.summary().to_dict("records")):
             name = str(row["actor"])
@@ -223,6 +222,15 @@ class RolloutEvaluation(Callback):
             prefix = "rollout" if rank == 0 else f"rollout/{name}"
             values |= {f"{prefix}/{key}": float(row[key]) for key in (*measured, "length")}
         return values
+
+    @staticmethod
+    def metrics(stage: str, selections: Sequence[str], measures_success: bool) -> set[str]:
+        """Names of what may be logged while a stage trains, for settings that are checked before anything is made."""
+        measured = _measured(measures_success)
+        if stage == "skill":
+            return {f"rollout/{key}" for key in (*measured, "length", *(f"best_skill_{key}" for key in measured))}
+        prefixes = ["rollout", *(f"rollout/{way}" for way in selections[1:])]
+        return {f"{prefix}/{key}" for prefix in prefixes for key in (*measured, "length")}
 
     # ---------------------------------------------------------------- state and end
 

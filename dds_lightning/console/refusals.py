@@ -7,6 +7,7 @@ import difflib
 import dis
 import re
 import sys
+import traceback
 from collections.abc import Iterable, Iterator
 
 from dds_lightning.errors import UserError
@@ -39,10 +40,19 @@ def as_user_errors(given: Iterable[str] = ()) -> Iterator[None]:
     except UserError:
         raise
     except Exception as error:
-        if (told := _told_by_a_process(error)) or (told := sentence(str(error)) if is_refusal(error) else ""):
+        if (told := _told_by_a_process(error)) or (told := _told(error) if is_refusal(error) else ""):
             about = [one for one in given if _is_about(told, one)]
             raise UserError(told.rstrip(".") + (f" (given: {' '.join(about)})" if about else "")) from error
         raise
+
+
+def _told(error: BaseException) -> str:
+    """What a refusal says; where it says nothing, what refused."""
+    if str(error):
+        return sentence(str(error))
+    frame = [frame for frame, _ in traceback.walk_tb(error.__traceback__)][-1]
+    name = type(frame.f_locals.get("self", frame)).__name__
+    return f"{name}.{frame.f_code.co_name} raises {type(error).__name__}: {name} cannot be used as it is"
 
 
 def is_refusal(error: BaseException) -> bool:
@@ -101,16 +111,22 @@ def _key_of(message: str) -> tuple[str, str]:
 
 def _of_union(key: str, message: str) -> str:
     """Of all the types that a value does not fit, the one that it was meant for."""
-    listed = message.partition("Errors:\n")[2].partition("Given value type:")[0]
+    listed = message.partition("Errors:\n")[2].rpartition("Given value type:")[0]
     given = message.rpartition("Given value: ")[2].strip()
-    errors = [" ".join(one.split()) for one in re.split(r"^\s+- (?=\S)", listed, flags=re.MULTILINE) if one.strip()]
-    for error in errors:
-        if (found := re.match(r"Problem with given class_path '([^']+)': (.*)", error)) is not None:
+    dash = re.match(r"\s*- ", listed)  # those of a union inside it are further to the right
+    parts = [one.strip() for one in re.split(f"^{dash[0]}", listed, flags=re.MULTILINE)] if dash else []
+    errors = [" ".join(one.split()) for one in parts if one]
+    for part in parts:
+        if (found := re.match(r"Problem with given class_path '([^']+)':\s*(.*)", part, re.DOTALL)) is not None:
             return f"{key or 'trainer'}: {_of_class(key, *found.groups())}"
+    for error in errors:
+        if not re.match(r"Expected an? |Not a valid |Unexpected import|Import of|Problem with", error):  # its own words
+            made = re.search(r"class_path='[\w.]*?(\w+)'", given)
+            return f"{made[1]}: {error}" if made else f"{key}: {error}" if key else error
     for error in errors:
         if (found := re.match(r"Expected a dot import path string: (\S+)", error)) is not None:
             return f"{key} is {found[1]}, and there is no such class{did_you_mean(found[1], _class_names())}"
-    expected = [found[1] for one in errors if (found := re.match(r"Expected an? (.+?)\.?$", one))]
+    expected = [found[1] for one in errors if (found := re.match(r"Expected an? (.+?)(?:\. Got value: .*|\.?)$", one))]
     return f"{key or 'value'} is {given}, expected {_expected(expected, given)}"
 
 
@@ -125,7 +141,7 @@ def _of_class(key: str, path: str, problem: str) -> str:
         code = getattr(getattr(getattr(module, name, None), "__init__", None), "__code__", None)
         known = code.co_varnames[1 : code.co_argcount + code.co_kwonlyargcount] if code else ()
         return f"{name} has no argument {strange[1]}{did_you_mean(strange[1], known)}"
-    return f"{name}: {problem}"
+    return f"{name}: {sentence(problem)}"
 
 
 def _class_names() -> list[str]:

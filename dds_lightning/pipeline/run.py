@@ -41,6 +41,8 @@ def run_all(settings: RunSettings) -> Report:
                 partial(step.work, run),
                 step.former(run) if step.former else None,
             )
+            if step.name == "data":
+                run.trainings.refuse_late_validations(int(run.facts("data")["facts"]["steps"]))
             if step.name == settings.until:
                 break
     return _report(run)

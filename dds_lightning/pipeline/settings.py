@@ -15,6 +15,7 @@ from dds_lightning.console.reports import Report
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import Task, get_task, is_own
 from dds_lightning.training.alone import run_alone
+from dds_lightning.training.monitors import refuse_late_validation
 from dds_lightning.training.stage_cli import StageCLI, command_line, parsed
 from dds_lightning.training.stages import STAGES, preset_configs
 
@@ -105,6 +106,8 @@ class Trainings:
             except UserError as error:
                 raise UserError(f"{stage}: {error}") from error
         self._settle_interval()
+        if wanted.data is None:
+            self.refuse_late_validations(wanted.data_steps + task.max_episode_steps)
 
     def _parse(self, stage: str, spec: str) -> None:
         """Parse a training's arguments and try its Trainer, on one device unless more are asked for."""
@@ -116,6 +119,19 @@ class Trainings:
         if cli.trial_trainer().strategy.launcher is not None:
             self._in_processes.add(stage)
         self._parsed[stage] = cli
+
+    def refuse_late_validations(self, steps: int) -> None:
+        """Refuse intervals between validations that are longer than an epoch of data with so many steps.
+
+        Raises:
+            UserError: Names the stage.
+        """
+        for stage, cli in self._parsed.items():
+            try:
+                if any(name.startswith("val/") for name in cli.stage.metrics):
+                    refuse_late_validation(cli.settings, steps)
+            except UserError as error:
+                raise UserError(f"{stage}: {error}") from error
 
     # ---------------------------------------------------------------- evaluating while the policy trains
 

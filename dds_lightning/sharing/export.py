@@ -115,17 +115,20 @@ def export_agent(agent: DDSAgent, path: str | Path, format: Format = "onnx", *, 
         The file.
 
     Raises:
-        UserError: The agent chooses its skills without a policy, the format is unknown, or a package for it is missing.
+        UserError: The agent chooses its skills without a policy, the format is unknown or not that of the file's name,
+            or a package for it is missing.
     """
     if format not in SUFFIXES:
         raise UserError(f"format is '{format}', expected one of {', '.join(SUFFIXES)}")
+    path = Path(path)
+    if path.suffix != SUFFIXES[format]:
+        raise UserError(f"--out is {path}, expected a name that ends in {SUFFIXES[format]} for the format {format}")
     if format == "onnx":
         _need("onnx", "onnxscript")
     graph, facts = ActingGraph(agent.cpu()), json.dumps(describe(agent, task))
     example = example_inputs(agent, 2)
     batch = torch.export.Dim("batch", min=1)
     shapes = ({0: batch}, {0: batch}, {0: batch}, {1: batch})
-    path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(path) as part, _quietly():
         if format == "torch":

@@ -39,7 +39,7 @@ def record(
         raise UserError(f"{source} does not say which task it is for: give --task; `dds tasks` lists them")
     agent = DDSAgent.load(source, seed=seed, **acting)
     refuse_other_task(agent, source, wanted)
-    footage, rows = _play(agent, wanted, episodes, seed)
+    footage, rows = play_footage(agent, wanted, episodes, seed)
     pictures, fps, how = episode_pictures(wanted, footage)
     path = write_video(out, pictures, fps)
     shown = pd.DataFrame(rows)
@@ -51,7 +51,7 @@ def record(
     return Report({"file": path, "task": wanted.name, "seed": seed, "pictures": how, "results": shown}, lines)
 
 
-def _play(agent: DDSAgent, task: Task, episodes: int, seed: int) -> tuple[list[Footage], list[dict[str, Any]]]:
+def play_footage(agent: DDSAgent, task: Task, episodes: int, seed: int) -> tuple[list[Footage], list[dict[str, Any]]]:
     """Play one episode after the other, with the environment seeds of `dds evaluate`."""
     footage, rows = [], []
     with open_env(task) as env:
@@ -65,7 +65,7 @@ def _play(agent: DDSAgent, task: Task, episodes: int, seed: int) -> tuple[list[F
                 qpos += [] if data is None else [data.qpos.copy()]
                 observation, reward, terminated, truncated, info = env.step(agent.act(observation))
                 positions.append(info.get("position", (np.nan, np.nan)))
-                codes.append(int(agent.codes[0]))
+                codes.append(int(agent.codes[0]) if agent.discrete else -1)
                 total, success, over = total + float(reward), success or info["success"], terminated or truncated
             qpos += [] if data is None else [data.qpos.copy()]
             path = RolloutPath(np.array(positions, np.float32), np.array(codes, np.int16))

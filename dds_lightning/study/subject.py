@@ -75,8 +75,8 @@ def find_subject(place: Path, seed: int = 0, asked: str | None = None) -> Subjec
     directory = agent_directory(place)
     from dds_lightning.saving.published import load_published
 
-    kept = restore_task(load_published(directory).config, directory)
-    task = kept.name if kept else task
+    if task is None and (kept := restore_task(load_published(directory).config, directory)):
+        task = kept.name
     found = Findings.read(place) if (place / "evaluate" / "episodes.parquet").is_file() else None
     return Subject(DDSAgent.load(directory, seed=seed), task, data, found, f"published agent {_shown(directory)}")
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from dds_lightning.envs.build import build_env
@@ -23,7 +25,6 @@ Flat = NDArray[np.float32]
 
 def make_task_env(task: Task, render_mode: str | None = None) -> gym.Env[Flat, Flat]:
     """Build what `Task.make_env` promises."""
-    adapters = {"flat": TaskEnv, "maze": MazeEnv, "kitchen": KitchenEnv}
     options = {"continuing_task": False} if task.adapter == "maze" else {}
     env = build_env(
         task.env_id,
@@ -32,7 +33,7 @@ def make_task_env(task: Task, render_mode: str | None = None) -> gym.Env[Flat, F
         **options,
         **task.env_options,
     )
-    return adapters[task.adapter](env, task)
+    return ADAPTERS[task.adapter](env, task)
 
 
 @contextlib.contextmanager
@@ -55,6 +56,15 @@ class TaskEnv(gym.Wrapper[Flat, Flat, Any, Any], gym.utils.RecordConstructorArgs
         self.task = task
         gym.Wrapper.__init__(self, env)
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (task.observation_dim,), np.float32)
+
+    @property
+    def spec(self) -> EnvSpec | None:  # type: ignore[override]  # an attribute of `Env`, a property of `Wrapper`
+        """From which Gymnasium makes this environment again, also from JSON (`EnvSpec.from_json`)."""
+        spec = super().spec
+        if spec is not None:
+            *others, own = spec.additional_wrappers
+            spec.additional_wrappers = (*others, replace(own, entry_point="dds_lightning.tasks.again:wrapped"))
+        return spec
 
     @property
     def unwrapped(self) -> gym.Env[Any, Any]:
@@ -138,3 +148,7 @@ class KitchenEnv(TaskEnv):
     def flatten(self, observation: Any) -> Any:
         """Robot positions (9), object positions (21), goal (30)."""
         return np.concatenate([kitchen_layout(observation["observation"]), goal_vector(self.task.subtasks)], axis=-1)
+
+
+ADAPTERS = {"flat": TaskEnv, "maze": MazeEnv, "kitchen": KitchenEnv}
+"""`Task.adapter` -> its wrapper."""

@@ -6,7 +6,7 @@ from typing import Any
 
 from dds_lightning.tasks import get_task
 from dds_lightning.tasks.bodies import action_names, observation_names
-from dds_lightning.tasks.task import Cell, Task
+from dds_lightning.tasks.task import Cell, Task, bounds_text
 
 REWARDS = {
     "environment": "r is the environment's own reward, as recorded",
@@ -90,7 +90,7 @@ def task_lines(task: Task) -> list[tuple[str, str]]:
         ("observation", f"{task.observation_dim} numbers: {task.observation_layout}"),
         (
             "action",
-            f"{task.action_dim} numbers from {task.action_low:g} to {task.action_high:g}: "
+            f"{task.action_dim} numbers from {bounds_text(task.action_low)} to {bounds_text(task.action_high)}: "
             f"{', '.join(action_names(task))}",
         ),
         ("episode", f"at most {task.max_episode_steps} steps of {task.step_seconds:g} s, {_seconds(task):g} s in all"),

@@ -10,7 +10,8 @@ score_max: -4                 # the return that scores 100, for example of an ex
 Other attributes of a `Task` are optional; if not given, widths and action bounds are read from the environment. Where
 its observations are a dictionary, `observation_keys` says which entries are put end to end, in which order:
 `[observation, desired_goal]` shows the goal to the agent, `[observation]` does not. `action_low` and `action_high` are
-the bounds of actions, `measures_success: true` counts episodes whose `info` says `success` or `is_success`.
+the bounds of actions, a number each or a list with one for every entry, `measures_success: true` counts episodes whose
+`info` says `success` or `is_success`.
 A file may also give a maze of the table another goal or start cell: `task: pointmaze-large-diverse` with
 `goal: [7, 1]` or `start: [1, 1]`, (row, column), is what `pointmaze-large-diverse?goal=7,1` is on the command line.
 
@@ -54,6 +55,8 @@ GIVEN = (
     *("reward_scale", "reward_shift", "score_min", "score_max", "evaluation_episodes"),
 )
 """Attributes of a `Task` that a file may give."""
+BOUNDS = ("action_low", "action_high")
+"""Those that may be a list."""
 STATE = ("positions", "velocities", "hidden")
 """Fields that say where the simulator's state is in an observation."""
 NEEDED = ("env_id", "max_episode_steps", "score_min", "score_max")
@@ -67,7 +70,12 @@ _KINDS: dict[str, tuple[str, type | tuple[type, ...]]] = {
     "bool": ("true or false", bool),
     "Mapping[str, Any]": ("a mapping of names to values", dict),
     "tuple[str, ...]": ("a list of names", list),
+    "float | tuple[float, ...]": ("a number, or a list with one for each entry of an action", (int, float, list)),
 }
+
+
+class OwnCodeError(UserError):
+    """The environment of a definition that came with an agent needs code or files, which only the user may name."""
 
 
 def is_address(name: str) -> bool:
@@ -115,9 +123,10 @@ def _cells(given: Mapping[str, Any], where: str) -> str:
 def definition(task: Task) -> dict[str, Any]:
     """Return a custom task as plain values, from which `build_task` restores it."""
     values: dict[str, Any] = {name: getattr(task, name) for name in GIVEN}
+    values = {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
     values["env_options"] = dict(values["env_options"])
-    if keys := values.pop("observation_keys"):
-        values["observation_keys"] = list(keys)
+    if not values["observation_keys"]:
+        del values["observation_keys"]
     if task.body == task.name and has_state(task):
         layout = state_layout(task, task.observation_dim)
         values |= {"positions": list(layout.positions), "velocities": list(layout.velocities), "hidden": layout.hidden}
@@ -134,7 +143,7 @@ def build_task(given: Mapping[str, Any], where: str, trusted: bool = True) -> Ta
             come with an agent. In that case the environment is not built before it is played.
 
     Raises:
-        UserError: See `load_task`.
+        UserError: See `load_task`; an `OwnCodeError` where only `trusted` stands in the way.
     """
     for name in given:
         if name not in (*GIVEN, *STATE):
@@ -150,23 +159,27 @@ def build_task(given: Mapping[str, Any], where: str, trusted: bool = True) -> Ta
         value: Any = given[name]
         if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
             raise UserError(f"task: {where} sets {name} to {value!r}, expected {description}")
-        values[name] = float(str(value)) if types[name] == "float" else value
+        entries = value if isinstance(value, list) and name in BOUNDS else [value]
+        if name in BOUNDS and not all(type(entry) in (int, float) for entry in entries):
+            raise UserError(f"task: {where} sets {name} to {value!r}, expected {description}")
+        numbers = tuple(float(str(entry)) for entry in entries) if "float" in types[name] else ()
+        values[name] = (numbers if isinstance(value, list) else numbers[0]) if numbers else value
     values["observation_keys"] = tuple(values.get("observation_keys", ()))
     _check(values, where, trusted)
     asked = {} if not trusted and "observation_dim" in values else _read_environment(values, where)
     values = {"family": FAMILY, "measures_success": False, **asked, **values}
     task = Task(**values, body=values["name"])
+    _check_box(task, where)
     layout = {name: given[name] for name in STATE if given.get(name) is not None}
     BODIES[task.name] = _body(task, layout, where) if layout else Body()
     return task
 
 
 def _check(values: Mapping[str, Any], where: str, trusted: bool) -> None:
-    pattern = r"([\w.]+:)?[\w./-]+" if trusted else r"[\w./-]+"
     rules = [
         ("name", re.fullmatch(r"[\w-]+", values["name"]) is not None, "letters, digits, '_' and '-'"),
         ("family", trusted or re.fullmatch(r"[\w-]+", values.get("family", FAMILY)) is not None, "a preset's name"),
-        ("env_id", re.fullmatch(pattern, values["env_id"]) is not None, "a name that Gymnasium knows"),
+        ("env_id", re.fullmatch(r"([\w.]+:)?[\w./-]+", values["env_id"]) is not None, "a name that Gymnasium knows"),
         ("max_episode_steps", values["max_episode_steps"] >= 1, "at least 1"),
         ("max_episode_steps", trusted or values["max_episode_steps"] <= 10**6, "at most a million"),
         ("evaluation_episodes", trusted or values.get("evaluation_episodes", 1) <= 10**5, "at most 100,000"),
@@ -180,12 +193,31 @@ def _check(values: Mapping[str, Any], where: str, trusted: bool) -> None:
     for name, fine, expected in rules:
         if not fine:
             raise UserError(f"task: {where} sets {name} to {values[name]!r}, expected {expected}")
-    options = values.get("env_options", {})
-    if not trusted and not all(type(value) in (bool, int, float) for value in options.values()):
-        raise UserError(f"task: {where} sets env_options to {options!r}, expected numbers, true or false")
-    for name in ("score_min", "score_max", "reward_scale", "reward_shift", "action_low", "action_high"):
+    for name in ("score_min", "score_max", "reward_scale", "reward_shift"):
         if not np.isfinite(values.get(name, 0.0)):
             raise UserError(f"task: {where} sets {name} to {values[name]!r}, expected a finite number")
+    options, yours = values.get("env_options", {}), "if that is your own, name its task file with --task"
+    if not trusted and ":" in values["env_id"]:
+        raise OwnCodeError(f"task: {where} sets env_id to {values['env_id']!r}, which imports code: {yours}")
+    if not trusted and not all(type(value) in (bool, int, float) for value in options.values()):
+        raise OwnCodeError(f"task: {where} sets env_options to {options!r}, expected numbers, true or false: {yours}")
+
+
+def _check_box(task: Task, where: str) -> None:
+    """Refuse bounds of actions that are not finite, the wrong way round, or of another width than the actions."""
+    for name in BOUNDS:
+        bound = getattr(task, name)
+        if isinstance(bound, tuple) and len(bound) != task.action_dim:
+            expected = f"one number, or {task.action_dim}, one for each entry of an action"
+            raise UserError(f"task: {where} sets {name} to {list(bound)}, expected {expected}")
+    low, high = task.action_box()
+    wrong = np.flatnonzero(~(np.isfinite(low) & np.isfinite(high) & (low < high)))
+    if len(wrong):
+        j = int(wrong[0])
+        raise UserError(
+            f"task: {where}: action_low is {low[j]:g} and action_high {high[j]:g} in entry {j} of an action, expected "
+            "finite numbers, the lower one first"
+        )
 
 
 def _are_names(keys: tuple[Any, ...]) -> bool:
@@ -210,18 +242,19 @@ def _read_environment(values: Mapping[str, Any], where: str) -> dict[str, Any]:
         width, taken = _observation_width(env.observation_space, values, where), env.action_space
         if not isinstance(taken, gym.spaces.Box) or len(taken.shape) != 1:
             raise UserError(f"task: {where}: the actions of {values['env_id']} are {taken}, {_FLAT}")
-        low, high = np.unique(taken.low), np.unique(taken.high)
-        if "action_low" not in values and (len(low) > 1 or len(high) > 1 or not np.isfinite([*low, *high]).all()):
+        box = {"action_low": taken.low, "action_high": taken.high}
+        if not all(name in values or np.isfinite(bound).all() for name, bound in box.items()):
             raise UserError(
                 f"task: {where}: the actions of {values['env_id']} have bounds {taken.low} to {taken.high}, expected "
-                "the same finite ones for every entry; rescale them with gymnasium.wrappers.RescaleAction"
+                "finite ones: set action_low and action_high, a number each or a list with one for every entry"
             )
         found = {"observation_dim": width, "action_dim": taken.shape[0]}
         for name, width in found.items():
             if values.get(name, width) != width:
                 raise UserError(f"task: {where} sets {name} to {values[name]}, but {values['env_id']} has {width}")
         seconds = getattr(env.unwrapped, "dt", None) or 1.0
-        return {**found, "action_low": float(low[0]), "action_high": float(high[0]), "step_seconds": float(seconds)}
+        bounds = {name: tuple(bound.tolist()) if np.ptp(bound) else float(bound[0]) for name, bound in box.items()}
+        return {**found, **bounds, "step_seconds": float(seconds)}
     finally:
         env.close()
 

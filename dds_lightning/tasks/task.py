@@ -16,6 +16,12 @@ from dds_lightning.errors import UserError
 Cell = tuple[int, int]
 
 
+def bounds_text(bound: ArrayLike) -> str:
+    """A bound of all actions, or one for each entry, for people: `-1`, or `(-2, -1)`."""
+    numbers = [f"{number:g}" for number in np.ravel(bound)]
+    return numbers[0] if len(set(numbers)) == 1 else f"({', '.join(numbers)})"
+
+
 @dataclass(frozen=True)
 class Task:
     """One row of the task table.
@@ -33,8 +39,8 @@ class Task:
             one goal.
         observation_layout: Description of the numbers in an observation, in order.
         action_dim: A.
-        action_low: Lower bound of every action entry.
-        action_high: Upper bound of every action entry.
+        action_low: Lower bound of every action entry, or of each, A numbers.
+        action_high: Upper bound, likewise.
         max_episode_steps: Steps after which an evaluation episode is truncated.
         step_seconds: Simulated seconds per step.
         env_options: Further arguments to the environment's constructor.
@@ -81,8 +87,8 @@ class Task:
     max_episode_steps: int
     step_seconds: float
     observation_layout: str = ""
-    action_low: float = -1.0
-    action_high: float = 1.0
+    action_low: float | tuple[float, ...] = -1.0
+    action_high: float | tuple[float, ...] = 1.0
     env_options: Mapping[str, Any] = field(default_factory=dict, hash=False)
     observation_keys: tuple[str, ...] = ()
     adapter: Literal["flat", "maze", "kitchen"] = "flat"
@@ -182,6 +188,11 @@ class Task:
             paper_score=None,
             **changes,
         )
+
+    def action_box(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Lower and upper bounds of actions, (A,) each."""
+        size = (self.action_dim,)
+        return np.full(size, self.action_low, np.float32), np.full(size, self.action_high, np.float32)
 
     def accepts(self, env_id: str) -> bool:
         """Whether recordings from an environment fit this task without changes."""

@@ -32,6 +32,7 @@ from dds_lightning.saving.files import short
 from dds_lightning.saving.untrusted import mapping, parse_yaml
 from dds_lightning.tasks.own import is_address
 from dds_lightning.training.fit import advice_on_memory, fit, quieten
+from dds_lightning.training.monitors import refuse_unlogged
 from dds_lightning.training.precision import OVERRULED, settle_precision
 from dds_lightning.training.resuming import (
     expand_paths,
@@ -63,12 +64,11 @@ class StageCLI(LightningCLI):
         self.arguments = as_lists(resolve_configs(arguments), options)
         self.checkpoint: dict[str, Any] | None = None
         self.measured_precision: str | None = None
-        parser = {"exit_on_error": False}
         try:
-            self._parse(parser)
+            self._parse({"exit_on_error": False})
         except ArgumentError as error:
-            where = f"(see `dds {stage} {next(iter(arguments), 'fit')} --help`)"
-            raise UserError(f"{sentence(error.message)} {where}") from None
+            told, command = sentence(error.message), f"dds {stage} {next(iter(arguments), 'fit')} --help"
+            raise UserError(f"{told} (see `{command}{' trainer' * told.startswith('trainer')}`)") from None
 
     def _parse(self, parser: dict[str, Any]) -> None:
         """Let Lightning make its parser and parse."""
@@ -117,8 +117,9 @@ class StageCLI(LightningCLI):
         expand_paths(self.settings)
         data = self.settings.data
         refuse_seed("--seed_everything", int(self.settings.seed_everything))
-        if "seed" in data and data.seed is None:
-            data.seed = int(self.settings.seed_everything)
+        if "seed" in data:
+            data.seed = int(self.settings.seed_everything) if data.seed is None else data.seed
+            refuse_seed("data.seed", data.seed)
 
     @property
     def settings(self) -> Namespace:
@@ -159,7 +160,6 @@ class StageCLI(LightningCLI):
             settings.model.init_from = None  # a file of settings says how the training began that goes on here
         settings.ckpt_path = str(path)
         self.checkpoint = load_checkpoint(str(path), self.stage.name)
-        linked = {f"model.{name}" for name in self.stage.links}
         trained = {f"model.{name}": value for name, value in self.checkpoint["hyper_parameters"].items()}
         if self.config.subcommand == "fit":  # one may look at a model with other data
             trained |= self.checkpoint.get(TrainingSettings.KEY, {})
@@ -169,7 +169,7 @@ class StageCLI(LightningCLI):
             raise UserError(f"checkpoint {path} was trained for task {task}: give --data.task={task} again")
         refuse_conflicts(trained, chosen, path)
         for name, value in trained.items():
-            if name not in linked and name in settings:
+            if name.removeprefix("model.") not in self.stage.links and name in settings:
                 settings[name] = value
 
     def _take_shape(self, model: Namespace) -> None:
@@ -202,8 +202,10 @@ class StageCLI(LightningCLI):
         Raises:
             UserError: They do not fit each other, or the checkpoint.
         """
-        if self.config.subcommand == "fit" and (requeued := requeued_checkpoint(self.settings)):
-            self.resume(requeued)
+        if self.config.subcommand == "fit":
+            refuse_unlogged(self.stage, self.settings)
+            if requeued := requeued_checkpoint(self.settings):
+                self.resume(requeued)
         self.measured_precision = settle_precision(self.settings)
         with as_user_errors(self.arguments):
             super()._set_seed()
@@ -231,6 +233,7 @@ class StageCLI(LightningCLI):
         Raises:
             UserError: Settings of the Trainer, a logger or a callback that cannot work.
         """
+        refuse_unlogged(self.stage, self.settings)
         with as_user_errors(self.arguments):
             return trial_trainer(self.settings.trainer)
 

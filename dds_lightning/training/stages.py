@@ -35,6 +35,7 @@ class Stage:
         in_presets: Whether every preset folder must have a `NAME.yaml` for it.
         preset: Packaged configuration where a preset folder has none; None takes the module's defaults.
         threads: Threads of torch while fitting; None leaves torch's own number.
+        metrics: Names of everything that its `fit` can log, whatever its settings; empty where nobody has listed them.
     """
 
     name: str
@@ -47,6 +48,7 @@ class Stage:
     in_presets: bool = False
     preset: str | None = None
     threads: int | None = None
+    metrics: tuple[str, ...] = ()
 
     def module_class(self) -> type[StageModule]:
         """Import the module."""
@@ -56,6 +58,15 @@ class Stage:
         """Import the data module."""
         return _import(self.data)
 
+
+def _named(**names: str) -> tuple[str, ...]:
+    return tuple(f"{prefix}/{name}" for prefix, listed in names.items() for name in listed.split())
+
+
+_SKILL_LOSSES = "loss denoising codebook commitment kl perplexity codes_used"
+_POLICY_TERMS = (
+    "value_loss q_loss actor_loss v_mean v_min v_max q_mean advantage_std clipped_share effective_sample_size"
+)
 
 STAGES: dict[str, Stage] = {
     stage.name: stage
@@ -69,6 +80,7 @@ STAGES: dict[str, Stage] = {
             steps=500_000,  # the paper's, as are the defaults of the module
             widths="data.horizon or model.hidden_dim",
             in_presets=True,
+            metrics=_named(train=_SKILL_LOSSES, val=f"{_SKILL_LOSSES} reconstruction_rmse dead_codes"),
         ),
         Stage(
             name="policy",
@@ -79,6 +91,7 @@ STAGES: dict[str, Stage] = {
             steps=1_500_000,
             widths="model.hidden_dims",
             in_presets=True,
+            metrics=_named(train=f"loss {_POLICY_TERMS}", val=f"{_POLICY_TERMS} code_accuracy entropy"),
         ),
         Stage(
             name="clone",
@@ -90,6 +103,7 @@ STAGES: dict[str, Stage] = {
             widths="model.hidden_dims",
             preset="clone.yaml",
             threads=1,  # more gain little on an idle machine and cost much on a busy one
+            metrics=_named(train="loss", val="loss"),
         ),
         Stage(
             name="online",
@@ -101,6 +115,10 @@ STAGES: dict[str, Stage] = {
             widths="model.hidden_dims or data.replay_size",
             preset="online.yaml",
             threads=1,
+            metrics=_named(
+                train="loss q_loss novelty_loss actor_loss temperature_loss q_mean q_min q_max entropy alpha",
+                online="env_steps episodes return success cells",
+            ),
         ),
     )
 }

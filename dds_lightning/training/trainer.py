@@ -37,6 +37,8 @@ RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ("limit_train_batches", lambda value: value != 0, "more: nothing would be trained"),
     ("log_every_n_steps", lambda value: value >= 0, "at least 0"),
     ("precision", lambda value: value not in HALF, "bf16-mixed or 16-mixed: distances to codes need 32-bit weights"),
+    ("gradient_clip_val", lambda value: value >= 0, "at least 0, or null: a negative one turns gradients round"),
+    ("num_sanity_val_steps", lambda value: value >= -1, "at least 0, or -1 for all"),
     ("num_nodes", lambda value: value >= 1, "at least 1"),
 )
 """Settings of the Trainer that fail in the middle of a training, or with which nothing happens, without a word."""

@@ -24,6 +24,41 @@ LINES = [
     ("S --trainer.logger=WandbLoger", "did you mean WandbLogger?"),
     ("S --trainer.logger=CSVLogger", "CSVLogger needs save_dir: give --trainer.logger.save_dir=VALUE"),
     ("S --trainer.callbacks+=EarlyStopping", "EarlyStopping needs monitor"),
+    (
+        "S --trainer.callbacks+=EarlyStopping --trainer.callbacks.monitor=val_loss",
+        "monitor of EarlyStopping is val_loss, which the skill training never logs, expected one of train/codebook, ",
+    ),
+    ("S --trainer.callbacks+=ModelCheckpoint --trainer.callbacks.monitor=val/los", "did you mean val/loss"),
+    ("S --best.monitor=val_loss", "did you mean val/loss"),
+    ("S --best.monitor=val/loss --trainer.limit_val_batches=0", "best.monitor is val/loss, which"),
+    ("S --best.monitor=val/loss --data.validation_fraction=0", "best.monitor is val/loss, which"),
+    ("S --best.monitor=val/loss --best.every_n_steps=-3", "best.every_n_steps is -3, expected at least 1"),
+    (
+        "S --trainer.callbacks+=EarlyStopping --trainer.callbacks.monitor=val/loss --trainer.callbacks.mode=maxx",
+        "EarlyStopping: `mode` can be",
+    ),
+    ("S --trainer.callbacks+=Timer --trainer.callbacks.duration=abc", "Timer: `Timer(duration='abc')` is not a valid"),
+    (
+        "S --trainer.callbacks+=dds_lightning.callbacks.RolloutEvaluation --trainer.callbacks.episodes=0",
+        "rollout evaluation: episodes is 0, expected 1 or more",
+    ),
+    (
+        "S --trainer.logger=TensorBoardLogger --trainer.logger.save_dir=x --trainer.logger.version=[1]",
+        "version is [1], expected a whole number or text or null (see `dds skill fit --help trainer`)",
+    ),
+    ("S --trainer.gradient_clip_val=-1", "trainer.gradient_clip_val is -1"),
+    ("S --trainer.num_sanity_val_steps=-5", "trainer.num_sanity_val_steps is -5, expected at least 0"),
+    ("S --seed_everything=1e10", "seed_everything is 1e10, expected true or false or a whole number (see"),
+    ("S --best.monitor=rollout/score", "which only a RolloutEvaluation logs: add --trainer.callbacks+="),
+    ("S --stop.when=converged --stop.monitor=loss", "stop.monitor is loss, which the skill training never logs"),
+    ("R --policy.stop.when=converged", "policy: stop.monitor is val/loss, which the policy training never logs"),
+    ("R --policy.best.monitor=val/reward", "policy: best.monitor is val/reward"),
+    ("R --clone.best.monitor=val/rmse", "clone: best.monitor is val/rmse"),
+    ("R --online.best.monitor=val/loss", "online: best.monitor is val/loss"),
+    (
+        "R --policy.trainer.check_val_every_n_epoch=1 --policy.trainer.val_check_interval=50000",
+        "policy: trainer.val_check_interval is 50000, but an epoch has at most",
+    ),
     ("S --trainer.callbacks+=EarlyStoping", "did you mean EarlyStopping?"),
     (
         "S --trainer.callbacks+=EarlyStopping --trainer.callbacks.moniter=x",
@@ -76,6 +111,7 @@ LINES = [
     ("S --seed_everything=-1", "--seed_everything is -1, expected a whole number from 0"),
     ("S --seed_everything=20261128123456", "20261128123456"),
     ("S --data.seed=-1", "data.seed is -1"),
+    ("R --policy.data.seed=-4", "policy: data.seed is -4, expected a whole number from 0"),
     ("R --seed=-1", "--seed is -1"),
     ("R --seed=20261128123456", "--seed is 20261128123456"),
     ("R --skill.seed_everything=-1", "--seed_everything is -1"),
@@ -90,8 +126,7 @@ LINES = [
 ]
 LATE = [
     ("--trainer.val_check_interval=5000", "val_check_interval"),
-    ("--trainer.callbacks+=EarlyStopping --trainer.callbacks.monitor=val_loss --trainer.max_steps=60", "`val_loss`"),
-    ("--best.monitor=val_loss --trainer.max_steps=60", "monitor='val_loss'"),
+    ("--trainer.callbacks+=BaseFinetuning", "BaseFinetuning cannot be used as it is"),
 ]
 """What shows only when the training has begun."""
 

@@ -143,6 +143,10 @@ def test_what_needs_no_policy_is_refused_and_nothing_is_written(tmp_path):
         export_agent(agent, tmp_path / "agent.onnx")
     with pytest.raises(UserError, match="format is 'tflite', expected one of torch, onnx"):
         export_agent(make_agent(), tmp_path / "agent.tflite", "tflite")
+    for name, form in (("agent", "onnx"), ("agent.pt2", "onnx"), ("agent.onnx", "torch")):
+        with pytest.raises(UserError, match=f"--out is .*{name}, expected .* for the format {form}"):
+            export_agent(make_agent(), tmp_path / name, form)
+        assert not (tmp_path / name).exists()
     assert not list(tmp_path.iterdir())
 
 

@@ -2,10 +2,15 @@
 
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import torch
 from PIL import Image
 
+from dds_lightning import SkillModule
+from dds_lightning.errors import UserError
+from dds_lightning.study.videos import RolloutVideos
 from tests.fits import QUIET, SKILL, call, of_data
 
 CALLBACK = ["--trainer.callbacks+=dds_lightning.study.videos.RolloutVideos", "--trainer.callbacks.every_n_steps=2"]
@@ -32,12 +37,24 @@ def test_each_evaluation_leaves_a_clip_beside_the_logs(tmp_path_factory):
         assert first.encoded_image_string == clips[0].read_bytes()
 
 
-def test_a_task_without_a_maze_is_refused_before_training(capfd):
-    from dds_lightning.errors import UserError
-    from dds_lightning.study.videos import RolloutVideos
+@pytest.mark.parametrize("bottleneck", ["vq", "gaussian"])
+def test_a_robot_outside_mazes_is_shown_as_dds_record_shows_it(tmp_path, monkeypatch, bottleneck):
+    monkeypatch.setattr("dds_lightning.interpret.draw.video.render_frames", lambda task, states: None)  # no driver
+    module = SkillModule(11, 3, horizon=5, skill_dim=8, hidden_dim=16, num_skills=4, bottleneck=bottleneck)
+    module.normaliser.fit(torch.zeros(11), torch.ones(11))
+    module.action_box.fit(-torch.ones(3), torch.ones(3))
+    trainer = SimpleNamespace(
+        datamodule=None, lightning_module=module, log_dir=str(tmp_path), loggers=[], global_step=7
+    )
+    callback = RolloutVideos("hopper-medium", episodes=1)
+    callback.setup(trainer, module, "validate")
+    callback.show(trainer, None)
+    with Image.open(tmp_path / "videos" / "step_7.gif") as picture:
+        assert picture.n_frames >= 2
 
-    class Trainer:
-        datamodule = None
 
-    with pytest.raises(UserError, match="task is hopper-medium, expected a maze"):
-        RolloutVideos("hopper-medium").setup(Trainer(), None, "validate")
+def test_a_task_with_nothing_to_draw_is_refused_before_training(tmp_path):
+    task = tmp_path / "car.yaml"
+    task.write_text("env_id: MountainCarContinuous-v0\nmax_episode_steps: 20\nscore_min: -60\nscore_max: 0\n")
+    with pytest.raises(UserError, match="task is car, neither a maze nor simulated by MuJoCo"):
+        RolloutVideos(str(task)).setup(SimpleNamespace(datamodule=None), None, "validate")

@@ -1,8 +1,12 @@
 """Every task's environment in the hands of others: Gymnasium's checks, vectors of copies, stable-baselines3."""
 
+import json
+from dataclasses import asdict
+
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 from dds_lightning.tasks import get_task, task_names
@@ -25,8 +29,15 @@ def test_gymnasium_checks_it_and_makes_a_vector_of_it(name):
     first, _ = vector.reset(seed=[3, 4])
     np.testing.assert_array_equal(first[0], env.reset(seed=3)[0])
     action = vector.action_space.sample()
-    np.testing.assert_allclose(vector.step(action)[0][0], env.step(action[0])[0], rtol=1e-5, atol=1e-6)
+    reached = env.step(action[0])[0]
+    np.testing.assert_allclose(vector.step(action)[0][0], reached, rtol=1e-5, atol=1e-6)
     vector.close()
+    again = EnvSpec.from_json(env.spec.to_json()).make()
+    assert type(again) is type(env)
+    assert json.dumps(asdict(again.task)) == json.dumps(asdict(task))
+    np.testing.assert_array_equal(again.reset(seed=3)[0], first[0])
+    np.testing.assert_allclose(again.step(action[0])[0], reached, rtol=1e-5, atol=1e-6)
+    again.close()
     env.close()
 
 

@@ -10,6 +10,7 @@ from gymnasium.utils.env_checker import check_env
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import facts_to_keep, get_task, is_own, known_task, restore_task
 from dds_lightning.tasks.bodies import BODIES, Body, has_state, observation_names, state_layout
+from dds_lightning.tasks.facts import task_lines
 from dds_lightning.tasks.own import build_task, definition
 
 PENDULUM = {"env_id": "InvertedPendulum-v5", "max_episode_steps": 60, "score_min": 5, "score_max": 60}
@@ -28,6 +29,18 @@ def test_widths_box_and_seconds_are_read_from_the_environment(tmp_path):
     assert (task.measures_success, task.normalised_score(32.5)) == (False, 50.0)
     assert is_own(task)
     assert not is_own(get_task("hopper-medium@v5"))
+
+
+def test_the_bounds_of_actions_may_be_a_list_with_one_for_every_entry(tmp_path):
+    limits = {"action_low": [-2, -1, -0.5], "action_high": 1}
+    task = get_task(file(tmp_path / "leap.yaml", env_id="Hopper-v5", **limits))
+    assert (task.action_low, task.action_high) == ((-2.0, -1.0, -0.5), 1.0)
+    low, high = task.action_box()
+    assert (low.tolist(), high.tolist(), low.dtype) == ([-2.0, -1.0, -0.5], [1.0, 1.0, 1.0], np.float32)
+    assert dict(task_lines(task))["action"].startswith("3 numbers from (-2, -1, -0.5) to 1: ")
+    kept = facts_to_keep(task)
+    assert kept["task_definition"]["action_low"] == [-2.0, -1.0, -0.5]
+    assert restore_task(kept, "agent") == task
 
 
 def test_once_read_it_is_known_by_its_name_and_its_environment_plays(tmp_path):
@@ -98,6 +111,12 @@ def test_the_state_in_an_observation_may_be_said(tmp_path):
         ({"positions": [0, 9], "velocities": [2]}, r"sets positions to \[0, 9\], expected a list of columns of 0 to 3"),
         ({"name": "a/b"}, "sets name to 'a/b', expected letters"),
         ({"reward_scale": 0}, "sets reward_scale to 0.0, expected a positive number"),
+        ({"action_low": [-1, -1]}, r"sets action_low to \[-1.0, -1.0\], expected one number, or 1, one for each entry"),
+        ({"action_high": "[a]"}, r"sets action_high to \['a'\], expected a number, or a list with one for each entry"),
+        ({"action_high": [True]}, r"sets action_high to \[True\], expected a number, or a list"),
+        ({"action_low": 5}, "action_low is 5 and action_high 3 in entry 0 of an action, expected finite numbers, the"),
+        ({"action_high": ".inf"}, "action_low is -3 and action_high inf in entry 0"),
+        ({"score_min": [1]}, r"sets score_min to \[1\], expected a number"),
     ],
 )
 def test_what_cannot_work_is_refused_with_field_value_and_expectation(tmp_path, changes, message):

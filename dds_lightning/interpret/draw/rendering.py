@@ -22,7 +22,8 @@ from dds_lightning.errors import UserError
 from dds_lightning.interpret.draw.drawing import LABEL, grid, heading, write_title
 from dds_lightning.saving.arrays import read_npy, read_npz
 from dds_lightning.saving.untrusted import parse_json
-from dds_lightning.tasks import Task, facts_to_keep
+from dds_lightning.tasks import Task, is_own
+from dds_lightning.tasks.own import definition
 
 BACKENDS = ("egl", "osmesa", "glfw")
 """Tried in this order unless `MUJOCO_GL` names one."""
@@ -49,8 +50,8 @@ def render_frames(task: Task, qpos: NDArray[Any], width: int = 320, height: int 
     """
     qpos = np.asarray(qpos, dtype=np.float64)
     qpos = qpos[np.isfinite(qpos).all(axis=1)]
-    file = io.BytesIO()
-    np.savez(file, qpos=qpos, size=np.array([width, height]), task=np.array(json.dumps(facts_to_keep(task))))
+    file, asked = io.BytesIO(), definition(task) if is_own(task) else task.name
+    np.savez(file, qpos=qpos, size=np.array([width, height]), task=np.array(json.dumps(asked)))
     wanted = os.environ.get("MUJOCO_GL", "").lower()
     path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
     for backend in (wanted,) if wanted else BACKENDS:
@@ -123,11 +124,12 @@ def _render(facts: str, qpos: NDArray[np.float64], width: int, height: int) -> N
 
     from dds_lightning.interpret.measure.replay import simulator
     from dds_lightning.interpret.views import has_view, view_of
-    from dds_lightning.tasks import restore_task
+    from dds_lightning.tasks import known_task
+    from dds_lightning.tasks.own import build_task
 
     mujoco.GLContext(16, 16).free()  # without a driver the process ends here, before anything slow
-    task = restore_task(parse_json(facts, "the request"), "the request")
-    assert task is not None, "the caller passes a task"
+    asked = parse_json(facts, "the request")  # our own: its environment is already used by the caller
+    task = known_task(asked) if isinstance(asked, str) else build_task(asked, "the request")
     with simulator(task) as env:
         model: Any = env.unwrapped.model
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height

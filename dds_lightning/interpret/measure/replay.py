@@ -249,6 +249,7 @@ def play_skills(task: Task, skills: Skills, steps: int = 2000, seed: int = 0) ->
             arrays = {"observations": np.array(seen), "actions": np.array(taken), "rewards": np.array(rewards)}
             episodes.append({**arrays, "terminations": last & ended, "truncations": last & (not ended)})
     name = f"{task.name}, played"
-    made = Trajectories.from_episodes(name, episodes, action_low=task.action_low, action_high=task.action_high)
+    low, high = task.action_box()
+    made = Trajectories.from_episodes(name, episodes, action_low=low, action_high=high)
     fields: dict[str, Any] = {"name": name, **made.arrays(), "qpos": np.array(qpos), "qvel": np.array(qvel)}
     return Played(**fields)
