@@ -6,7 +6,8 @@ modules and data are named, and imported when they are used.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,6 +36,8 @@ class Stage:
         in_presets: Whether every preset folder must have a `NAME.yaml` for it.
         preset: Packaged configuration where a preset folder has none; None takes the module's defaults.
         threads: Threads of torch while fitting; None leaves torch's own number.
+        reads: Stages whose checkpoint it needs, and the setting that takes it.
+        in_run: Whether `dds run` knows its settings; baselines are trained by `dds STAGE fit` and `dds study` alone.
     """
 
     name: str
@@ -47,6 +50,8 @@ class Stage:
     in_presets: bool = False
     preset: str | None = None
     threads: int | None = None
+    reads: Mapping[str, str] = field(default_factory=dict)
+    in_run: bool = True
 
     def module_class(self) -> type[StageModule]:
         """Import the module."""
@@ -79,6 +84,7 @@ STAGES: dict[str, Stage] = {
             steps=1_500_000,
             widths="model.hidden_dims",
             in_presets=True,
+            reads={"skill": "data.skill"},
         ),
         Stage(
             name="clone",
@@ -101,6 +107,7 @@ STAGES: dict[str, Stage] = {
             widths="model.hidden_dims or data.replay_size",
             preset="online.yaml",
             threads=1,
+            reads={"skill": "data.skill"},
         ),
     )
 }
@@ -141,6 +148,11 @@ def get_stage(name: str) -> Stage:
     if name not in STAGES:
         raise UserError(f"stage is '{name}', expected one of {', '.join(STAGES)}")
     return STAGES[name]
+
+
+def run_stages() -> list[str]:
+    """Names of the stages whose settings `dds run` takes."""
+    return [name for name, stage in STAGES.items() if stage.in_run]
 
 
 def _import(address: str) -> Any:
