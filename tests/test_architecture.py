@@ -59,6 +59,8 @@ ROOMS = {
     "datamodules.relabelled": "errors saving skill tasks datamodules.loader datamodules.partial_codes "
     "datamodules.relabel "
     "datamodules.relabelling datamodules.sources datamodules.trajectories",
+    "datamodules.transitions": "envs errors skill datamodules.loader datamodules.relabel datamodules.relabelling "
+    "datamodules.segments",
     "datamodules.online": "errors online skill tasks datamodules.relabel datamodules.relabelled "
     "datamodules.relabelling",
     # training

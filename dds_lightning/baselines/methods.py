@@ -51,6 +51,8 @@ class Method:
         return getattr(import_module(module), name)({stage: str(checkpoints[stage]) for stage in self.stages})
 
 
+_MODULE = "dds_lightning.baselines.actors:of_module"
+
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
@@ -68,6 +70,8 @@ METHODS: dict[str, Method] = {
             stages=("clone",),
             actor="dds_lightning.baselines.actors:of_clone",
         ),
+        Method("idql", "IDQL", "Hansen-Estruch et al. (2023), equations 3, 4, 9, algorithm 2", ("idql",), _MODULE),
+        Method("dql", "Diffusion-QL", "Wang et al. (2022), equations 3 to 5", ("dql",), _MODULE),
     )
 }
 """Name -> method, ours first."""

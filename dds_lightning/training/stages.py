@@ -62,6 +62,29 @@ class Stage:
         return _import(self.data)
 
 
+def _baseline(
+    name: str,
+    description: str,
+    module: str,
+    data: str = "TransitionDataModule",
+    links: tuple[str, ...] = ("observation_dim", "action_dim"),
+    **more: Any,
+) -> Stage:
+    """The row of a baseline: a file of `baselines`, a data module of `datamodules.transitions`, a preset `NAME.yaml`."""
+    return Stage(
+        name=name,
+        description=description,
+        module=f"dds_lightning.baselines.{module}",
+        data=f"datamodules.transitions:{data}",
+        links=links,
+        steps=1_000_000,
+        preset=f"{name}.yaml",
+        threads=1,
+        in_run=False,
+        **{"widths": "model.hidden_dims", **more},
+    )
+
+
 STAGES: dict[str, Stage] = {
     stage.name: stage
     for stage in (
@@ -109,6 +132,8 @@ STAGES: dict[str, Stage] = {
             threads=1,
             reads={"skill": "data.skill"},
         ),
+        _baseline("idql", "IDQL: an IQL critic chooses among actions of a diffusion model.", "idql:IDQL"),
+        _baseline("dql", "Diffusion-QL: a diffusion policy that climbs Q.", "diffusion_ql:DiffusionQL"),
     )
 }
 """Name -> stage, in the order of the method."""
