@@ -179,9 +179,9 @@ class LatentDataModule(TransitionDataModule):
 class SequenceDataModule(SegmentDataModule):
     """Segments with what is still to be earned.
 
-    A batch is ``{"observations": (B, H, O), "actions": (B, H, A), "rewards": (B, H), "returns": (B, H), "steps": (B, H)}``:
-    learning rewards, the sum of these from each step to the end of its episode, discounted by gamma, and the number of
-    the step in its episode, from 0. Episodes shorter than H are left out.
+    A batch is ``{"observations": (B, H, O), "actions": (B, H, A), "rewards": (B, H), "returns": (B, H),
+    "steps": (B, H)}``: learning rewards, the sum of these from each step to the end of its episode, discounted by
+    gamma, and the number of the step in its episode, from 0. Episodes shorter than H are left out.
 
     Args:
         task: Name of a task; None accepts any valid data.

@@ -13,6 +13,7 @@ from dds_lightning.agent import DDSAgent
 from dds_lightning.baselines.behaviour_cloning import CloneActor
 from dds_lightning.online.parts import checkpoint_parts
 from dds_lightning.rollout.actors import Acted
+from dds_lightning.skill import SkillModule
 from dds_lightning.training.stages import get_stage
 
 Checkpoints = Mapping[str, str]
@@ -44,6 +45,13 @@ def of_skills(checkpoints: Checkpoints) -> DDSAgent:
     """Skills and a policy over them, greedy."""
     skill, policy = checkpoints.values()
     return DDSAgent(*checkpoint_parts(skill, policy), "greedy")
+
+
+def of_latents(checkpoints: Checkpoints) -> DDSAgent:
+    """Continuous skills and what chooses among them, greedy."""
+    skill, (stage, path) = checkpoints["skill"], list(checkpoints.items())[-1]
+    chooser: Any = get_stage(stage).module_class().load(path)
+    return DDSAgent(SkillModule.load(skill), chooser, "greedy")
 
 
 def of_clone(checkpoints: Checkpoints) -> CloneActor:

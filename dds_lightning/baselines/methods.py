@@ -51,6 +51,8 @@ class Method:
         return getattr(import_module(module), name)({stage: str(checkpoints[stage]) for stage in self.stages})
 
 
+_SKILLS = "dds_lightning.baselines.actors:of_latents"
+_CONTINUOUS = {"skill": {"model.bottleneck": "gaussian"}}
 _MODULE = "dds_lightning.baselines.actors:of_module"
 
 METHODS: dict[str, Method] = {
@@ -70,8 +72,29 @@ METHODS: dict[str, Method] = {
             stages=("clone",),
             actor="dds_lightning.baselines.actors:of_clone",
         ),
+        Method("td3bc", "TD3+BC", "Fujimoto and Gu (2021), equations 3 to 5", ("td3bc",), _MODULE, extra="baselines"),
+        Method("iql", "IQL", "Kostrikov et al. (2021), equations 5 to 7", ("iql",), _MODULE, extra="baselines"),
+        Method("cql", "CQL", "Kumar et al. (2020), equation 4", ("cql",), _MODULE, extra="baselines"),
+        Method(
+            "dt",
+            "DT",
+            "Chen et al. (2021), section 3, algorithm 1",
+            ("dt",),
+            "dds_lightning.baselines.decision_transformer:of_transformer",
+            extra="baselines",
+        ),
         Method("idql", "IDQL", "Hansen-Estruch et al. (2023), equations 3, 4, 9, algorithm 2", ("idql",), _MODULE),
         Method("dql", "Diffusion-QL", "Wang et al. (2022), equations 3 to 5", ("dql",), _MODULE),
+        Method("dd", "Decision Diffuser", "Ajay et al. (2022), equations 5 to 8", ("dd",), _MODULE),
+        Method(
+            "opal",
+            "OPAL",
+            "Ajay et al. (2020), skills; Kostrikov et al. (2021), equations 5 to 7 over them",
+            ("skill", "opal"),
+            _SKILLS,
+            _CONTINUOUS,
+        ),
+        Method("ldcq", "LDCQ", "Venkatraman et al. (2023), equations 6 to 8", ("skill", "ldcq"), _SKILLS, _CONTINUOUS),
     )
 }
 """Name -> method, ours first."""

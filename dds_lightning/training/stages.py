@@ -70,7 +70,7 @@ def _baseline(
     links: tuple[str, ...] = ("observation_dim", "action_dim"),
     **more: Any,
 ) -> Stage:
-    """The row of a baseline: a file of `baselines`, a data module of `datamodules.transitions`, a preset `NAME.yaml`."""
+    """The row of a baseline: a class in `baselines`, data of `datamodules.transitions`, a preset `NAME.yaml`."""
     return Stage(
         name=name,
         description=description,
@@ -84,6 +84,9 @@ def _baseline(
         **{"widths": "model.hidden_dims", **more},
     )
 
+
+_LATENT = ("observation_dim", "skill_dim", "skill_hash")
+_SKILL = {"skill": "data.skill"}
 
 STAGES: dict[str, Stage] = {
     stage.name: stage
@@ -107,7 +110,7 @@ STAGES: dict[str, Stage] = {
             steps=1_500_000,
             widths="model.hidden_dims",
             in_presets=True,
-            reads={"skill": "data.skill"},
+            reads=_SKILL,
         ),
         Stage(
             name="clone",
@@ -130,10 +133,38 @@ STAGES: dict[str, Stage] = {
             widths="model.hidden_dims or data.replay_size",
             preset="online.yaml",
             threads=1,
-            reads={"skill": "data.skill"},
+            reads=_SKILL,
+        ),
+        _baseline("td3bc", "TD3+BC, by d3rlpy.", "d3:TD3BC"),
+        _baseline("iql", "IQL over single steps, by d3rlpy.", "d3:IQL"),
+        _baseline("cql", "CQL, by d3rlpy.", "d3:CQL"),
+        _baseline(
+            "dt",
+            "Decision Transformer, by d3rlpy: actions from returns still wanted.",
+            "decision_transformer:DecisionTransformer",
+            "SequenceDataModule",
+            ("observation_dim", "action_dim", "horizon"),
+            widths="data.horizon or model.hidden_dim",
         ),
         _baseline("idql", "IDQL: an IQL critic chooses among actions of a diffusion model.", "idql:IDQL"),
         _baseline("dql", "Diffusion-QL: a diffusion policy that climbs Q.", "diffusion_ql:DiffusionQL"),
+        _baseline(
+            "dd",
+            "Decision Diffuser: plans of states for a wanted return, and the actions between them.",
+            "decision_diffuser:DecisionDiffuser",
+            "SequenceDataModule",
+            ("observation_dim", "action_dim", "horizon"),
+            widths="data.horizon or model.hidden_dim",
+        ),
+        _baseline("opal", "OPAL: IQL over continuous skills.", "opal:OPAL", "LatentDataModule", _LATENT, reads=_SKILL),
+        _baseline(
+            "ldcq",
+            "LDCQ: a diffusion prior over continuous skills and a critic that keeps to it.",
+            "ldcq:LDCQ",
+            "LatentDataModule",
+            _LATENT,
+            reads=_SKILL,
+        ),
     )
 }
 """Name -> stage, in the order of the method."""
