@@ -138,6 +138,7 @@ class LatentDataModule(TransitionDataModule):
             **relabelling,
         )
         self.relabelling = Relabelling(**relabelling)  # told once more so that the command line finds its fields
+        self.save_hyperparameters("skill")  # what a refusal names
         self.skill = SkillModule.load(skill)
         if self.skill.discrete:
             raise UserError(

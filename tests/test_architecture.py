@@ -83,8 +83,8 @@ ROOMS = {
     "skill study tasks training datamodules.collect datamodules.inspection datamodules.relabelled "
     "datamodules.relabelling datamodules.relabel datamodules.sources",
     "dds_lightning.cli": "_version agent baselines console errors interpret.draw online pipeline policy saving "
-    "sharing skill study tasks training datamodules.collect datamodules.inspection datamodules.listing datamodules.physics "
-    "datamodules.relabel datamodules.relabelled datamodules.relabelling datamodules.sources",
+    "sharing skill study tasks training datamodules.collect datamodules.inspection datamodules.listing "
+    "datamodules.physics datamodules.relabel datamodules.relabelled datamodules.relabelling datamodules.sources",
     "dds_lightning.__main__": "cli",
 }
 """Room -> those it may import, apart from itself; `dds_lightning.` is left out in the second column."""

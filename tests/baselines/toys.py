@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from datamodules.trajectories import Trajectories
+from dds_lightning.callbacks.resume import ExactResume
 
 LENGTH = 8
 
@@ -33,7 +34,7 @@ def two_modes(episodes: int = 200, seed: int = 0) -> Trajectories:
     return Trajectories.from_episodes("two modes", made)
 
 
-def train(module, data, steps: int, **options):
+def train(module, data, steps: int, checkpoint: str | None = None, **options):
     trainer = pl.Trainer(
         max_steps=steps,
         max_epochs=-1,
@@ -46,8 +47,32 @@ def train(module, data, steps: int, **options):
         check_val_every_n_epoch=None,
         **options,
     )
-    trainer.fit(module, datamodule=data)
+    trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
     return module
+
+
+def assert_resumes(make, data, folder) -> None:
+    """A training that stopped after 4 of 9 steps and went on ends with the bits of one that never stopped.
+
+    Args:
+        make: Makes the module.
+        data: Makes the data module.
+        folder: For the checkpoint.
+    """
+
+    def go(steps, checkpoint=None):
+        torch.manual_seed(0)
+        module = make()
+        train(module, data(), steps, checkpoint, callbacks=[ExactResume()])
+        assert module.trainer.global_step == steps
+        return module
+
+    through = go(9)
+    go(4).trainer.save_checkpoint(folder / "4.ckpt")
+    resumed = go(9, str(folder / "4.ckpt"))
+    started = make().state_dict()
+    assert any(not torch.equal(value, started[name]) for name, value in through.state_dict().items())
+    assert all(torch.equal(value, resumed.state_dict()[name]) for name, value in through.state_dict().items())
 
 
 def regret(actor, episodes: int = 32) -> float:
