@@ -82,7 +82,7 @@ ROOMS = {
     "dds_lightning.pipeline": "agent baselines configs console errors interpret.draw online policy rollout saving "
     "skill study tasks training datamodules.collect datamodules.inspection datamodules.relabelled "
     "datamodules.relabelling datamodules.relabel datamodules.sources",
-    "dds_lightning.cli": "_version agent baselines console errors interpret.draw online pipeline policy saving "
+    "dds_lightning.cli": "_version agent baselines console errors interpret.draw online pipeline policy rollout saving "
     "sharing skill study tasks training datamodules.collect datamodules.inspection datamodules.listing "
     "datamodules.physics datamodules.relabel datamodules.relabelled datamodules.relabelling datamodules.sources",
     "dds_lightning.__main__": "cli",
