@@ -222,8 +222,9 @@ class SegmentDataModule(pl.LightningDataModule):
         return TensorLoader(gather, len(segments), self.batch_size, device=device, **options)
 
     def _device(self) -> torch.device:
-        resident = self.device_resident and self.trainer is not None
-        return self.trainer.strategy.root_device if resident else torch.device("cpu")
+        if self.device_resident and self.trainer is not None:
+            return self.trainer.strategy.root_device
+        return torch.device("cpu")
 
     def _tensors(self, device: torch.device) -> tuple[Tensor, Tensor]:
         if device not in self._on_device:

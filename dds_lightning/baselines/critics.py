@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call
@@ -139,8 +137,8 @@ class CriticModule(StageModule):
     def after_step(self, step: int) -> None:
         """Move the targets."""
         for target, online, rate in self.followers(step):
-            pairs: Any = (list(target.parameters()), list(online.parameters()))
-            torch._foreach_lerp_(*pairs, rate)
+            moved: list[Tensor] = list(target.parameters())
+            torch._foreach_lerp_(moved, list(online.parameters()), rate)
 
     def evaluate(self, batch: Batch, stage: str) -> None:
         """Log the losses on held-out episodes."""

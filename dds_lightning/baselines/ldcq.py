@@ -86,7 +86,7 @@ class LDCQ(LatentModule):
         self._refuse(rules)
         self.normaliser, self.skills = Normaliser(observation_dim), Normaliser(skill_dim)
         shape = (observation_dim, skill_dim, 0, hidden_dim, blocks, 0.0, diffusion_steps)
-        self.prior = DiffusionDecoder(*shape, clip=False)  # type: ignore[arg-type]  # skills lie in no box
+        self.prior = DiffusionDecoder(*shape, clip=False)  # skills lie in no box
         self.critic = TwinCritic(observation_dim, skill_dim, hidden_dims)
         self._begin(init_from)
 
