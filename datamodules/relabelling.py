@@ -69,8 +69,8 @@ class Relabelling:
         """Discount of one step outside a skill: gamma, or gamma^(1/H) where a skill of H steps counts gamma."""
         return self.gamma if self.discount == "per_step" else self.gamma ** (1.0 / horizon)
 
-    def learning_rewards(self, trajectories: Trajectories, horizon: int) -> NDArray[np.float64]:
-        """What the critic learns from at each step of the data, (N,).
+    def affine(self, trajectories: Trajectories, horizon: int) -> tuple[float, float]:
+        """Scale and shift of the learning rewards, ``scale * (reward + shift)``, with numbers in place of ``auto``.
 
         Args:
             trajectories: The data.
@@ -82,11 +82,16 @@ class Relabelling:
             shift = self.reward_shift or 0.0
         elif not trajectories.terminations.any():
             shift = -float(rewards.mean())
-        rewards += shift
         if self.reward_scale != "auto":
-            return (1.0 if self.reward_scale is None else self.reward_scale) * rewards
+            return 1.0 if self.reward_scale is None else self.reward_scale, shift
+        rewards += shift
         spread = float(returns_to_go(rewards, trajectories.lengths, self.step_discount(horizon)).std())
-        return rewards * (RETURN_SPREAD / spread if spread > 1e-12 else 1.0)
+        return RETURN_SPREAD / spread if spread > 1e-12 else 1.0, shift
+
+    def learning_rewards(self, trajectories: Trajectories, horizon: int) -> NDArray[np.float64]:
+        """What the critic learns from at each step of the data, (N,); arguments as of `affine`."""
+        scale, shift = self.affine(trajectories, horizon)
+        return scale * (trajectories.rewards.astype(np.float64) + shift)
 
     def settings(self) -> dict[str, Any]:
         """Every field by name."""

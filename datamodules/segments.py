@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Literal
 
 import lightning.pytorch as pl
 import numpy as np
@@ -41,6 +41,8 @@ class SegmentDataModule(pl.LightningDataModule):
     """
 
     trajectories: Trajectories
+    tail: Literal["full", "terminated"] = "full"
+    """Whether segments that a termination cuts short count, see `datamodules.windows.sliding_windows`."""
 
     def __init__(
         self,
@@ -137,7 +139,7 @@ class SegmentDataModule(pl.LightningDataModule):
         if self._windows is not None:
             return
         data = self._loaded()
-        self._windows = data.windows(self.horizon, self.stride)
+        self._windows = data.windows(self.horizon, self.stride, self.tail)
         self.training_episodes, self.validation_episodes = data.split(self.validation_fraction, self.seed, self.horizon)
         held_out = np.isin(self._windows.episodes, self.validation_episodes)
         self.training_segments = np.flatnonzero(~held_out)
@@ -205,9 +207,7 @@ class SegmentDataModule(pl.LightningDataModule):
 
     def _loader(self, segments: NDArray[np.int64], **options: Any) -> TensorLoader:
         assert self._windows is not None
-        device = torch.device("cpu")
-        if self.device_resident and self.trainer is not None:
-            device = self.trainer.strategy.root_device
+        device = self._device()
         observations, actions = self._tensors(device)
         first_rows = torch.from_numpy(self._windows.observation_starts[segments]).to(device)
         first_steps = torch.from_numpy(self._windows.starts[segments]).to(device)
@@ -220,6 +220,11 @@ class SegmentDataModule(pl.LightningDataModule):
             }
 
         return TensorLoader(gather, len(segments), self.batch_size, device=device, **options)
+
+    def _device(self) -> torch.device:
+        if self.device_resident and self.trainer is not None:
+            return self.trainer.strategy.root_device
+        return torch.device("cpu")
 
     def _tensors(self, device: torch.device) -> tuple[Tensor, Tensor]:
         if device not in self._on_device:

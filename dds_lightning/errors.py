@@ -38,7 +38,7 @@ class UserError(ValueError):
         super().__init__(text if len(text) <= LONGEST else f"{text[:700]} ... {text[-300:]}")
 
 
-def lacks_extra(what: str, extra: str) -> UserError:
+def lacks_extra(what: str, extra: str, more: str = "") -> UserError:
     """The error of a package that is not installed.
 
     It names the checkout and no package of an index: under the name of this project anybody could put one there.
@@ -46,8 +46,10 @@ def lacks_extra(what: str, extra: str) -> UserError:
     Args:
         what: What needs which package, as the sentence begins.
         extra: The extra of this project that brings it.
+        more: Another command, for a package that no extra can bring.
     """
-    return UserError(f"{what}: run `pip install -e '.[{extra}]' -c constraints.txt` in this project's checkout")
+    command = f"pip install -e '.[{extra}]' -c constraints.txt{more and f' && {more}'}"
+    return UserError(f"{what}: run `{command}` in this project's checkout")
 
 
 class ToldAlreadyError(UserError):

@@ -59,12 +59,14 @@ ROOMS = {
     "datamodules.relabelled": "errors saving skill tasks datamodules.loader datamodules.partial_codes "
     "datamodules.relabel "
     "datamodules.relabelling datamodules.sources datamodules.trajectories",
+    "datamodules.transitions": "envs errors skill datamodules.loader datamodules.relabel datamodules.relabelling "
+    "datamodules.segments",
     "datamodules.online": "errors online skill tasks datamodules.relabel datamodules.relabelled "
     "datamodules.relabelling",
     # training
     "dds_lightning.callbacks": "agent console envs errors online policy rollout skill tasks",
     "dds_lightning.training": "callbacks configs console errors finetune module saving tasks",
-    "dds_lightning.baselines": "errors module nn rollout tasks training",
+    "dds_lightning.baselines": "agent errors losses module nn online policy rollout saving skill tasks training",
     # what came of it
     "dds_lightning.interpret.views": "errors tasks",
     "dds_lightning.interpret.measure": "envs errors interpret.views tasks datamodules.physics datamodules.relabel "
@@ -80,9 +82,9 @@ ROOMS = {
     "dds_lightning.pipeline": "agent baselines configs console errors interpret.draw online policy rollout saving "
     "skill study tasks training datamodules.collect datamodules.inspection datamodules.relabelled "
     "datamodules.relabelling datamodules.relabel datamodules.sources",
-    "dds_lightning.cli": "_version agent console errors interpret.draw online pipeline policy saving sharing skill "
-    "study tasks training datamodules.collect datamodules.inspection datamodules.listing datamodules.physics "
-    "datamodules.relabel datamodules.relabelled datamodules.relabelling datamodules.sources",
+    "dds_lightning.cli": "_version agent baselines console errors interpret.draw online pipeline policy rollout saving "
+    "sharing skill study tasks training datamodules.collect datamodules.inspection datamodules.listing "
+    "datamodules.physics datamodules.relabel datamodules.relabelled datamodules.relabelling datamodules.sources",
     "dds_lightning.__main__": "cli",
 }
 """Room -> those it may import, apart from itself; `dds_lightning.` is left out in the second column."""

@@ -17,7 +17,7 @@ from dds_lightning.errors import UserError
 from dds_lightning.pipeline.settings import RunSettings
 from dds_lightning.tasks import get_task, task_names
 from dds_lightning.training.stage_cli import settings_of
-from dds_lightning.training.stages import preset_configs
+from dds_lightning.training.stages import preset_configs, run_stages
 
 
 def _flat(value, prefix=""):
@@ -38,12 +38,9 @@ def test_every_packaged_configuration_parses_and_nothing_in_it_is_lost(name):
 
 def test_every_family_of_tasks_has_a_preset_and_so_has_the_paper():
     for family in {get_task(name).family for name in task_names()} | {"paper"}:
-        assert {path.name for path in preset_configs(family).values()} == {
-            "skill.yaml",
-            "policy.yaml",
-            "clone.yaml",
-            "online.yaml",
-        }
+        found = preset_configs(family)
+        assert {found[name].name for name in run_stages()} == {"skill.yaml", "policy.yaml", "clone.yaml", "online.yaml"}
+        assert all(path.name == f"{name}.yaml" for name, path in found.items())
 
 
 def test_the_papers_online_settings_are_table_6():

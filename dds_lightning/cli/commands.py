@@ -164,7 +164,8 @@ def evaluate(
     Args:
         directory: A run of `dds run`, or a published checkpoint; left out with --skill.
         skill: Skill checkpoint (.ckpt) of `dds skill fit` instead of a run.
-        policy: Policy checkpoint (.ckpt) of `dds policy fit` to go with it.
+        policy: Policy checkpoint (.ckpt) of `dds policy fit` to go with it; or a baseline's, with --skill where it has
+            skills.
         task: Name of the task; without it the one the agent was made for.
         episodes: Episodes for each way of choosing skills; without it the task's default.
         selection: How skills are chosen: greedy, sample, argmax_q, random; several give one row each.
@@ -175,8 +176,12 @@ def evaluate(
         workers: Number of processes for the environments; without it one per core.
         out: Parquet file for the table of episodes.
     """
+    from dds_lightning.cli.methods import baseline_at, evaluate_baseline
     from dds_lightning.study.evaluate import evaluate as play
 
+    if directory in (None, "-") and policy is not None and (method := baseline_at(policy)):
+        of_codes = {"noise_scale": noise_scale, "temperature": None if temperature == 1.0 else temperature}
+        return evaluate_baseline(method, policy, skill, task, episodes, seed, workers, out, **of_codes)
     return play(
         None if directory in (None, "-") else Path(str(directory)),
         skill=skill,

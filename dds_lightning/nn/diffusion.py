@@ -87,6 +87,7 @@ class DiffusionDecoder(nn.Module):
         time_dim: Width of the time embedding.
         sampler: ``ddpm`` draws from the posterior, ``ddim`` follows the deterministic path (Song et al., 2020).
         clip: Keep the predicted x0 in [-1, 1] at every step.
+        net: The noise prediction network, of the concatenated input; by default the residual backbone.
     """
 
     betas: Tensor
@@ -107,13 +108,13 @@ class DiffusionDecoder(nn.Module):
         time_dim: int = 16,
         sampler: Sampler = "ddpm",
         clip: bool = True,
+        net: nn.Module | None = None,
     ) -> None:
         super().__init__()
         self.action_dim, self.diffusion_steps = action_dim, diffusion_steps
         self.sampler, self.clip = sampler, clip
-        self.net = ResidualMLP(
-            action_dim + time_dim + skill_dim + observation_dim, action_dim, hidden_dim, blocks, dropout
-        )
+        width = action_dim + time_dim + skill_dim + observation_dim
+        self.net = net or ResidualMLP(width, action_dim, hidden_dim, blocks, dropout)
         betas = vp_betas(diffusion_steps, beta_min, beta_max)
         self.register_buffer("betas", betas.float())
         self.register_buffer("alpha_bars", torch.cumprod(1.0 - betas, dim=0).float())

@@ -26,7 +26,10 @@ class Acted(NamedTuple):
 
 
 class Actor(Protocol):
-    """An agent, a controller, a baseline; anything that a `Contestant` plays with."""
+    """An agent, a controller, a baseline; anything that a `Contestant` plays with.
+
+    One that has a method `paid(rewards, rows)` is told after every step what its actions (n,) earned in `rows`.
+    """
 
     def reset(self, num_envs: int, seed: int | None = None) -> None:
         """Forget everything and get ready for `num_envs` environments."""

@@ -140,8 +140,17 @@ class _Match:
         self._remember(alive, start["position"][alive], start["observation"][alive])
         rows: list[dict[str, Any]] = []
         while len(alive := pool.alive):
-            rows += self._note(alive, pool.step(self._act(actors, alive)))
+            records = pool.step(self._act(actors, alive))
+            self._pay(actors, alive, records["reward"])
+            rows += self._note(alive, records)
         return rows
+
+    def _pay(self, actors: list[ActorSlots], slots: NDArray[np.intp], rewards: NDArray[Any]) -> None:
+        """Tell the actors that ask for it what their last actions earned."""
+        for one in actors:
+            if paid := getattr(one.actor, "paid", None):
+                own = slice(*np.searchsorted(slots, (one.low, one.high)))
+                paid(np.asarray(rewards[own], dtype=np.float32), slots[own] - one.low)
 
     def _note(self, slots: NDArray[np.intp], records: NDArray[Any]) -> list[dict[str, Any]]:
         """Record one step of some slots; return the rows of the episodes that have ended."""

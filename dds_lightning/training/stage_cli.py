@@ -240,7 +240,8 @@ class StageCLI(LightningCLI):
     def _instantiate_trainer(self, config: dict[str, Any], callbacks: list[pl.Callback]) -> pl.Trainer:
         callbacks = [*callbacks, TrainingSettings(self._settings_to_keep())]
         trainer: pl.Trainer = super()._instantiate_trainer(trainer_settings(dict(config), callbacks), [])
-        alternates = self.model.hparams.get("extraction") == "after"  # of a policy: first the critic, then the actor
+        h = self.model.hparams  # first the critic, then the actor; or first the prior, then the critic
+        alternates = h.get("extraction") == "after" or bool(h.get("prior_steps"))
         if alternates and isinstance(trainer.strategy, DDPStrategy):
             trainer.strategy._ddp_kwargs.setdefault("find_unused_parameters", True)
         return trainer

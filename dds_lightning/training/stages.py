@@ -6,7 +6,8 @@ modules and data are named, and imported when they are used.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,6 +37,8 @@ class Stage:
         preset: Packaged configuration where a preset folder has none; None takes the module's defaults.
         threads: Threads of torch while fitting; None leaves torch's own number.
         metrics: Names of everything that its `fit` can log, whatever its settings; empty where nobody has listed them.
+        reads: Stages whose checkpoint it needs, and the setting that takes it.
+        in_run: Whether `dds run` knows its settings; baselines are trained by `dds STAGE fit` and `dds study` alone.
     """
 
     name: str
@@ -49,6 +52,8 @@ class Stage:
     preset: str | None = None
     threads: int | None = None
     metrics: tuple[str, ...] = ()
+    reads: Mapping[str, str] = field(default_factory=dict)
+    in_run: bool = True
 
     def module_class(self) -> type[StageModule]:
         """Import the module."""
@@ -67,6 +72,31 @@ _SKILL_LOSSES = "loss denoising codebook commitment kl perplexity codes_used"
 _POLICY_TERMS = (
     "value_loss q_loss actor_loss v_mean v_min v_max q_mean advantage_std clipped_share effective_sample_size"
 )
+def _baseline(
+    name: str,
+    description: str,
+    module: str,
+    data: str = "TransitionDataModule",
+    links: tuple[str, ...] = ("observation_dim", "action_dim"),
+    **more: Any,
+) -> Stage:
+    """The row of a baseline: a class in `baselines`, data of `datamodules.transitions`, a preset `NAME.yaml`."""
+    return Stage(
+        name=name,
+        description=description,
+        module=f"dds_lightning.baselines.{module}",
+        data=f"datamodules.transitions:{data}",
+        links=links,
+        steps=1_000_000,
+        preset=f"{name}.yaml",
+        threads=1,
+        in_run=False,
+        **{"widths": "model.hidden_dims", **more},
+    )
+
+
+_LATENT = ("observation_dim", "skill_dim", "skill_hash")
+_SKILL = {"skill": "data.skill"}
 
 STAGES: dict[str, Stage] = {
     stage.name: stage
@@ -92,6 +122,7 @@ STAGES: dict[str, Stage] = {
             widths="model.hidden_dims",
             in_presets=True,
             metrics=_named(train=f"loss {_POLICY_TERMS}", val=f"{_POLICY_TERMS} code_accuracy entropy"),
+            reads=_SKILL,
         ),
         Stage(
             name="clone",
@@ -119,6 +150,37 @@ STAGES: dict[str, Stage] = {
                 train="loss q_loss novelty_loss actor_loss temperature_loss q_mean q_min q_max entropy alpha",
                 online="env_steps episodes return success cells",
             ),
+            reads=_SKILL,
+        ),
+        _baseline("td3bc", "TD3+BC, by d3rlpy.", "d3:TD3BC"),
+        _baseline("iql", "IQL over single steps, by d3rlpy.", "d3:IQL"),
+        _baseline("cql", "CQL, by d3rlpy.", "d3:CQL"),
+        _baseline(
+            "dt",
+            "Decision Transformer, by d3rlpy: actions from returns still wanted.",
+            "decision_transformer:DecisionTransformer",
+            "SequenceDataModule",
+            ("observation_dim", "action_dim", "horizon"),
+            widths="data.horizon or model.hidden_dim",
+        ),
+        _baseline("idql", "IDQL: an IQL critic chooses among actions of a diffusion model.", "idql:IDQL"),
+        _baseline("dql", "Diffusion-QL: a diffusion policy that climbs Q.", "diffusion_ql:DiffusionQL"),
+        _baseline(
+            "dd",
+            "Decision Diffuser: plans of states for a wanted return, and the actions between them.",
+            "decision_diffuser:DecisionDiffuser",
+            "SequenceDataModule",
+            ("observation_dim", "action_dim", "horizon"),
+            widths="data.horizon or model.hidden_dim",
+        ),
+        _baseline("opal", "OPAL: IQL over continuous skills.", "opal:OPAL", "LatentDataModule", _LATENT, reads=_SKILL),
+        _baseline(
+            "ldcq",
+            "LDCQ: a diffusion prior over continuous skills and a critic that keeps to it.",
+            "ldcq:LDCQ",
+            "LatentDataModule",
+            _LATENT,
+            reads=_SKILL,
         ),
     )
 }
@@ -159,6 +221,11 @@ def get_stage(name: str) -> Stage:
     if name not in STAGES:
         raise UserError(f"stage is '{name}', expected one of {', '.join(STAGES)}")
     return STAGES[name]
+
+
+def run_stages() -> list[str]:
+    """Names of the stages whose settings `dds run` takes."""
+    return [name for name, stage in STAGES.items() if stage.in_run]
 
 
 def _import(address: str) -> Any:

@@ -1,0 +1,127 @@
+"""LDCQ: latent diffusion constrained Q-learning (Venkatraman et al., 2023).
+
+```
+ skills  z ~ q(z | tau)                     the skill stage with a Gaussian bottleneck (equation 3)
+ L_prior = E[ min(SNR(t), 5) || z - z_hat(z_t, t, s) ||^2 ]                          equation 6
+ L_Q = E[ (R + gamma (1 - done) max_i min_j target Q_j(s', z_i) - Q(s, z))^2 ],  z_i ~ prior(. | s')   equation 7
+ acts with argmax_i Q(s, z_i),  z_i ~ prior(. | s)                                   equation 8
+```
+
+The network predicts noise, and ``|| z - z_hat ||^2 = || eps - eps_hat ||^2 / SNR(t)``, so the prior's loss is the same.
+Departures: z is the mean of q, T follows our decoder's schedule, and the data are drawn evenly, without priorities.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import ClassVar, Literal
+
+import torch
+from torch import Tensor, nn
+
+import dds_lightning.losses as losses
+from dds_lightning.baselines.critics import Batch, Loss, TwinCritic, draw, take
+from dds_lightning.baselines.opal import LatentModule
+from dds_lightning.nn.diffusion import DiffusionDecoder
+from dds_lightning.nn.normaliser import Normaliser
+
+
+class LDCQ(LatentModule):
+    """A diffusion prior over continuous skills, then Q-learning among what it proposes.
+
+    Args:
+        observation_dim: O, linked from the data on the command line.
+        skill_dim: D, linked from the data.
+        hidden_dims: Widths of Q.
+        prior_steps: Steps of the prior; those that remain up to ``max_steps`` go to Q on the frozen prior.
+        samples: Skills proposed in a state when acting.
+        backup_samples: Skills proposed in the next state for the target.
+        snr_clip: Greatest weight of a noise level in the prior's loss.
+        hidden_dim: Width of the prior.
+        blocks: Its residual blocks.
+        diffusion_steps: T.
+        target_ema: Rate of the target critic.
+        lr: Adam's learning rate.
+        lr_schedule: ``constant``, or ``cosine`` decay to zero at ``max_steps``.
+        init_from: ``.ckpt`` or published directory with the initial weights (`dds_lightning.finetune`).
+        skill_hash: Fingerprint of the skill model, linked from the data; null if unknown.
+
+    Raises:
+        UserError: A setting is outside its range; the message names it.
+    """
+
+    STAGE = "ldcq"
+    PARTS: ClassVar = {"prior": ("prior",), "critic": ("critic",)}
+    SHAPE = ("skill_dim", "hidden_dims", "hidden_dim", "blocks", "diffusion_steps")
+
+    def __init__(
+        self,
+        observation_dim: int,
+        skill_dim: int,
+        hidden_dims: Sequence[int] = (256, 256, 256),
+        prior_steps: int = 500_000,
+        samples: int = 100,
+        backup_samples: int = 10,
+        snr_clip: float = 5.0,
+        hidden_dim: int = 256,
+        blocks: int = 4,
+        diffusion_steps: int = 10,
+        target_ema: float = 0.005,
+        lr: float = 5e-4,
+        lr_schedule: Literal["constant", "cosine"] = "constant",
+        init_from: str | None = None,
+        skill_hash: str | None = None,
+    ) -> None:
+        super().__init__()
+        hidden_dims = list(hidden_dims)
+        self.save_hyperparameters(ignore=["init_from"])
+        rules = [
+            ("prior_steps", prior_steps >= 0, "0 or more"),
+            ("samples", samples >= 1, "at least 1"),
+            ("backup_samples", backup_samples >= 1, "at least 1"),
+            ("snr_clip", snr_clip > 0, "positive"),
+            ("diffusion_steps", diffusion_steps >= 1, "at least 1"),
+            ("target_ema", 0 < target_ema <= 1, "in (0, 1]"),
+        ]
+        self._refuse(rules)
+        self.normaliser, self.skills = Normaliser(observation_dim), Normaliser(skill_dim)
+        shape = (observation_dim, skill_dim, 0, hidden_dim, blocks, 0.0, diffusion_steps)
+        self.prior = DiffusionDecoder(*shape, clip=False)  # skills lie in no box
+        self.critic = TwinCritic(observation_dim, skill_dim, hidden_dims)
+        self._begin(init_from)
+
+    def loss(self, batch: Batch) -> Loss:
+        """Equation 6 in the first ``prior_steps`` steps, equation 7 after."""
+        x, z = self.normaliser(batch["observations"]), self.skills(batch["actions"])
+        if self.global_step < self.hparams.prior_steps:
+            return self._sum({"prior_loss": self.prior_loss(x, z)}, {})
+        q = self.critic.both(x, z)
+        return self._sum({"q_loss": losses.td(q, self._target(batch))}, {"q_mean": q.mean()})
+
+    def prior_loss(self, states: Tensor, skills: Tensor) -> Tensor:
+        """Equation 6 for normalised states (B, O) and skills (B, D), the mean over B and D."""
+        t = torch.randint(self.prior.diffusion_steps, (len(skills),), device=skills.device)
+        noise = torch.randn_like(skills)
+        kept = self.prior.alpha_bars[t, None]
+        snr = kept / (1.0 - kept)  # (B, 1)
+        noisy = kept.sqrt() * skills + (1.0 - kept).sqrt() * noise
+        error = (self.prior.predict_noise(noisy, t, states, states[:, :0]) - noise).square()
+        return (snr.clamp_max(self.hparams.snr_clip) / snr * error).mean()
+
+    @torch.no_grad()
+    def _target(self, batch: Batch) -> Tensor:
+        count = self.hparams.backup_samples
+        wide, proposed = draw(self.prior, self.normaliser(batch["next_observations"]), count)
+        after = self.critic.least(wide, proposed).view(-1, count).amax(dim=-1)
+        return losses.td_target(batch["rewards"], batch["discounts"], batch["dones"], after)
+
+    def followers(self, step: int) -> list[tuple[nn.Module, nn.Module, float]]:
+        """The target critic moves after every step."""
+        return [(self.critic.target, self.critic.online, self.hparams.target_ema)]
+
+    def propose(self, states: Tensor, greedy: bool, generator: torch.Generator | None) -> Tensor:
+        """The best of the prior's proposals, or one of them."""
+        count = self.hparams.samples if greedy else 1
+        wide, proposed = draw(self.prior, states, count, generator)
+        index = self.critic.least(wide, proposed).view(-1, count).argmax(dim=-1)
+        return take(proposed.view(len(states), count, -1), index)
