@@ -64,7 +64,7 @@ ROOMS = {
     # training
     "dds_lightning.callbacks": "agent console envs errors online policy rollout skill tasks",
     "dds_lightning.training": "callbacks configs console errors finetune module saving tasks",
-    "dds_lightning.baselines": "errors module nn rollout tasks training",
+    "dds_lightning.baselines": "agent errors losses module nn online policy rollout saving skill tasks training",
     # what came of it
     "dds_lightning.interpret.views": "errors tasks",
     "dds_lightning.interpret.measure": "envs errors interpret.views tasks datamodules.physics datamodules.relabel "

@@ -13,7 +13,7 @@ from dds_lightning.cli.completion import script
 from dds_lightning.console.arguments import as_lists, list_options
 from dds_lightning.console.reports import Report
 from dds_lightning.errors import UserError, refuse_seed
-from dds_lightning.training.stages import STAGES
+from dds_lightning.training.stages import STAGES, run_stages
 
 Commands = Mapping[str, Any]  # name -> function, a group of commands, or None for one of Lightning's
 
@@ -93,7 +93,7 @@ def _add(parser: ArgumentParser, table: Commands, functions: dict[str, Callable[
             leaf.add_function_arguments(
                 entry, as_group=False, as_positional=True, skip={optional[0]} if optional else None
             )
-            for stage in STAGES if entry in TAKES_STAGES else ():
+            for stage in run_stages() if entry in TAKES_STAGES else ():
                 leaf.add_argument(f"--{stage}", type=list[str], default=[], help=f"Settings for `dds {stage} fit`")
             subcommands.add_subcommand(name, leaf, help=first)
             functions[prefix + name] = entry
@@ -136,7 +136,7 @@ def prepare(arguments: list[str]) -> list[str]:
     rest = iter(arguments)
     for argument in rest:
         stage, _, option = argument.removeprefix("--").partition(".")
-        if arguments[0] == "run" and argument.startswith("--") and stage in STAGES and option:
+        if arguments[0] == "run" and argument.startswith("--") and stage in run_stages() and option:
             if "=" not in option:
                 value = next(rest, None)
                 if value is None:
@@ -155,7 +155,7 @@ def options_of(path: Sequence[str]) -> list[str]:
         entry = entry[word]
     if isinstance(entry, Mapping):
         return list(entry)
-    stages = list(STAGES) if entry in TAKES_STAGES else []
+    stages = run_stages() if entry in TAKES_STAGES else []
     return ["json", *(inspect.signature(entry).parameters if entry else ()), *stages]
 
 
@@ -167,7 +167,7 @@ def refuse_settings(settings: Mapping[str, Any]) -> None:
     """
     if settings.get("seed") is not None:
         refuse_seed("--seed", settings["seed"])
-    for stage in STAGES:
+    for stage in run_stages():
         if settings.get(stage):
             from dds_lightning.training.options import refuse_typos
 
@@ -201,7 +201,9 @@ def _words() -> Iterator[tuple[tuple[str, ...], list[str]]]:
                 yield (name, subcommand), [*(f"--{one}=" for one in options(STAGES[name])), "--help"]
         else:
             stages = (
-                [f"--{stage}.{one}=" for stage in STAGES for one in options(STAGES[stage])] if name == "run" else []
+                [f"--{stage}.{one}=" for stage in run_stages() for one in options(STAGES[stage])]
+                if name == "run"
+                else []
             )
             yield (name,), [*_flags(entry, options_of([name])), *stages]
 

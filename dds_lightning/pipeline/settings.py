@@ -17,7 +17,7 @@ from dds_lightning.tasks import Task, get_task, is_own
 from dds_lightning.training.alone import run_alone
 from dds_lightning.training.monitors import refuse_late_validation
 from dds_lightning.training.stage_cli import StageCLI, command_line, parsed
-from dds_lightning.training.stages import STAGES, preset_configs
+from dds_lightning.training.stages import STAGES, preset_configs, run_stages
 
 WATCH_EPISODES = 10
 """Episodes of each evaluation while the policy trains."""
@@ -100,7 +100,7 @@ class Trainings:
         self._parsed: dict[str, StageCLI] = {}
         self._in_processes: set[str] = set()
         self._one_device: set[str] = set()
-        for stage in STAGES:
+        for stage in run_stages():
             try:
                 self._parse(stage, spec)
             except UserError as error:

@@ -6,7 +6,8 @@ modules and data are named, and imported when they are used.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,6 +37,8 @@ class Stage:
         preset: Packaged configuration where a preset folder has none; None takes the module's defaults.
         threads: Threads of torch while fitting; None leaves torch's own number.
         metrics: Names of everything that its `fit` can log, whatever its settings; empty where nobody has listed them.
+        reads: Stages whose checkpoint it needs, and the setting that takes it.
+        in_run: Whether `dds run` knows its settings; baselines are trained by `dds STAGE fit` and `dds study` alone.
     """
 
     name: str
@@ -49,6 +52,8 @@ class Stage:
     preset: str | None = None
     threads: int | None = None
     metrics: tuple[str, ...] = ()
+    reads: Mapping[str, str] = field(default_factory=dict)
+    in_run: bool = True
 
     def module_class(self) -> type[StageModule]:
         """Import the module."""
@@ -92,6 +97,7 @@ STAGES: dict[str, Stage] = {
             widths="model.hidden_dims",
             in_presets=True,
             metrics=_named(train=f"loss {_POLICY_TERMS}", val=f"{_POLICY_TERMS} code_accuracy entropy"),
+            reads={"skill": "data.skill"},
         ),
         Stage(
             name="clone",
@@ -119,6 +125,7 @@ STAGES: dict[str, Stage] = {
                 train="loss q_loss novelty_loss actor_loss temperature_loss q_mean q_min q_max entropy alpha",
                 online="env_steps episodes return success cells",
             ),
+            reads={"skill": "data.skill"},
         ),
     )
 }
@@ -159,6 +166,11 @@ def get_stage(name: str) -> Stage:
     if name not in STAGES:
         raise UserError(f"stage is '{name}', expected one of {', '.join(STAGES)}")
     return STAGES[name]
+
+
+def run_stages() -> list[str]:
+    """Names of the stages whose settings `dds run` takes."""
+    return [name for name, stage in STAGES.items() if stage.in_run]
 
 
 def _import(address: str) -> Any:
