@@ -137,7 +137,11 @@ class RayTasks:
         ray = _package("ray", "--engine=ray needs Ray", "ray")
         self.ray, self.slots = ray, workers or 1000
         if not ray.is_initialized():
-            ray.init(log_to_driver=False, configure_logging=False, **({} if "RAY_ADDRESS" in os.environ else {"num_cpus": workers}))
+            ray.init(
+                log_to_driver=False,
+                configure_logging=False,
+                **({} if "RAY_ADDRESS" in os.environ else {"num_cpus": workers}),
+            )
         # A worker that is lost is Ray's to replace; an error of ours is an answer, and not tried again.
         self._do = ray.remote(max_retries=TRIES - 1, num_cpus=cpus, num_gpus=gpus)(do)
 
@@ -178,14 +182,22 @@ class Slurm:
     """
 
     def __init__(
-        self, folder: Path, workers: int | None, cpus: int = 1, gpus: int = 0, minutes: int = 240, cluster: str = "slurm"
+        self,
+        folder: Path,
+        workers: int | None,
+        cpus: int = 1,
+        gpus: int = 0,
+        minutes: int = 240,
+        cluster: str = "slurm",
     ) -> None:
         submitit = _package("submitit", "--engine=slurm needs submitit", "slurm")
         self.slots = workers or 100
         try:
             self._executor = submitit.AutoExecutor(folder / "%j", cluster=cluster)
         except RuntimeError as error:
-            raise UserError(f"--engine is slurm, and submitit finds no Slurm here ({error}): run it on a login node") from None
+            raise UserError(
+                f"--engine is slurm, and submitit finds no Slurm here ({error}): run it on a login node"
+            ) from None
         self._executor.update_parameters(timeout_min=minutes, cpus_per_task=cpus, gpus_per_node=gpus, name="dds-study")
         self._threads, self._jobs, self.closed = ThreadPoolExecutor(self.slots), [], False
 

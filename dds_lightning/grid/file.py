@@ -52,7 +52,13 @@ EVALUATE: dict[str, Any] = {
 OURS = ("data.task", "data.data", "data.skill", "data.relabelled", "data.cache", "data.seed", "ckpt_path", "config")
 OURS += ("seed_everything", "trainer.default_root_dir", "checkpoint.dirpath", "print_config", "json")
 """Settings of a stage that the study sets itself."""
-BUDGETS = ("trainer.max_steps", "trainer.val_check_interval", "model.critic_steps", "model.warmup_steps", "stop.min_steps")
+BUDGETS = (
+    "trainer.max_steps",
+    "trainer.val_check_interval",
+    "model.critic_steps",
+    "model.warmup_steps",
+    "stop.min_steps",
+)
 """Settings of a stage that `--scale` multiplies."""
 _KEYS: dict[str, tuple[type, ...]] = {
     **{"title": (str,), "question": (str,), "tasks": (list,), "methods": (list, str), "seeds": (list,), "data": (str,)},
@@ -131,7 +137,12 @@ class Study:
     def coordinates(self) -> list[str]:
         """Everything by which two cells may differ, beside the seed."""
         more = ["variant"] if self.variants else []
-        return [*(["task"] if len(self.tasks) > 1 else []), *(["method"] if len(self.methods) > 1 else []), *self.grid, *more]
+        return [
+            *(["task"] if len(self.tasks) > 1 else []),
+            *(["method"] if len(self.methods) > 1 else []),
+            *self.grid,
+            *more,
+        ]
 
 
 def packaged_studies() -> list[str]:
@@ -170,7 +181,9 @@ def read_study(path: Path, scale: float = 1.0) -> Study:
         raise UserError(f"{path} is not a mapping, expected {', '.join(_KEYS)}")
     for key, value in found.items():
         if key not in _KEYS:
-            raise UserError(f"{path}: {key} is no setting of a study{did_you_mean(str(key), _KEYS)}; they are {', '.join(_KEYS)}")
+            raise UserError(
+                f"{path}: {key} is no setting of a study{did_you_mean(str(key), _KEYS)}; they are {', '.join(_KEYS)}"
+            )
         if not isinstance(value, _KEYS[key]) or isinstance(value, bool):
             raise UserError(f"{path}: {key} is {value!r}, expected a {_KEYS[key][0].__name__}")
     for key in ("title", "tasks"):
@@ -194,7 +207,12 @@ def _check(study: Study) -> None:
     Raises:
         UserError: Names the first.
     """
-    for name, values in (("tasks", study.tasks), ("methods", study.methods), ("seeds", study.seeds), *study.grid.items()):
+    for name, values in (
+        ("tasks", study.tasks),
+        ("methods", study.methods),
+        ("seeds", study.seeds),
+        *study.grid.items(),
+    ):
         if not isinstance(values, list | tuple) or not values:
             raise UserError(f"{name} is {values!r}, expected a list of one or more: the grid would be empty")
         if twice := [value for index, value in enumerate(values) if value in values[:index]]:
@@ -215,12 +233,16 @@ def _check(study: Study) -> None:
             refuse_uncollectable(task)
         run_defaults(study.preset or task.family)
     if study.data is not None and len(study.tasks) > 1:
-        raise UserError(f"data is {study.data} for {len(study.tasks)} tasks, expected one task, or none to collect data")
+        raise UserError(
+            f"data is {study.data} for {len(study.tasks)} tasks, expected one task, or none to collect data"
+        )
     if study.watch < 0:
         raise UserError(f"watch is {study.watch}, expected 0 (no evaluation while training) or more")
     for name, departure in study.variants.items():
         if not isinstance(departure, dict) or not departure or name == BASE:
-            raise UserError(f"variants: {name} is {departure!r}, expected settings; {BASE} is there without being named")
+            raise UserError(
+                f"variants: {name} is {departure!r}, expected settings; {BASE} is there without being named"
+            )
     trained = {stage for method in study.methods for stage in PLAYERS[method].stages}
     for key, values in _asked(study).items():
         for value in values:
@@ -252,15 +274,23 @@ def _check_setting(key: str, value: Any, trained: set[str]) -> None:
     if room == "evaluate" or key in ("data.steps", "data.seed"):
         known = ["data.steps", "data.seed", *(f"evaluate.{one}" for one in EVALUATE)]
         if key not in known:
-            raise UserError(f"{key} is no setting of the evaluation{did_you_mean(key, known)}; they are {', '.join(known)}")
+            raise UserError(
+                f"{key} is no setting of the evaluation{did_you_mean(key, known)}; they are {', '.join(known)}"
+            )
         if not (value in ("greedy", "sample", "argmax_q", "random") if name == "selection" else _is_number(value)):
-            raise UserError(f"{key} is {value!r}, expected {'greedy, sample, argmax_q or random' if name == 'selection' else 'a number'}")
+            raise UserError(
+                f"{key} is {value!r}, expected {'greedy, sample, argmax_q or random' if name == 'selection' else 'a number'}"
+            )
         return
     if room not in STAGES or not name:
         known = [f"{stage}.{one}" for stage in trained for one in options(STAGES[stage])]
-        raise UserError(f"{key} is no setting: write STAGE.KEY with a stage of {', '.join(sorted(trained))}{did_you_mean(key, known)}")
+        raise UserError(
+            f"{key} is no setting: write STAGE.KEY with a stage of {', '.join(sorted(trained))}{did_you_mean(key, known)}"
+        )
     if room not in trained:
-        raise UserError(f"{key} is a setting of {room}, which no method of this study trains ({', '.join(sorted(trained))})")
+        raise UserError(
+            f"{key} is a setting of {room}, which no method of this study trains ({', '.join(sorted(trained))})"
+        )
     if name in OURS:
         raise UserError(f"{key} is set by the study itself: leave it out")
     refuse_typos(room, ["fit", argument(name, value)], prefix=f"{room}.")

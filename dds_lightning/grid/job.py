@@ -16,7 +16,7 @@ from typing import Any
 from dds_lightning.errors import UserError
 from dds_lightning.saving.run_directory import RunDirectory, finished, locked, write_json
 
-NODES, LOGS, MADE = "nodes", "logs", "made.json"
+NODES, LOGS, LOCKS, MADE = "nodes", "logs", "locks", "made.json"
 PACKAGES = ("dds-lightning", "torch", "lightning", "numpy", "gymnasium", "mujoco")
 PATIENCE = 60.0
 """Seconds to wait for a worker of an earlier launch that is still saving in the same folder."""
@@ -39,7 +39,7 @@ def do(job: Job) -> dict[str, Any]:
     folder = root / job["key"]
     started = time.monotonic()
     try:
-        with _locked(folder):
+        with _locked(Path(job["root"]) / LOCKS / job["key"]):
             reads = {role: finished(root / key) for role, key in job["reads"].items()}
             if missing := [job["reads"][role] for role, done in reads.items() if done is None]:
                 raise UserError(f"{missing[0]}, which it reads, is not there any more: run the study again")

@@ -189,7 +189,9 @@ class _Planner:
         if (name, stage) not in self._defaults:
             known = options(STAGES[stage])
             ours = {*OURS, *STAGES[stage].reads.values(), *GENERAL} - {"precision"}
-            settings = {key: one.default for key, one in known.items() if key not in ours and not key.startswith("trainer.")}
+            settings = {
+                key: one.default for key, one in known.items() if key not in ours and not key.startswith("trainer.")
+            }
             settings |= {"trainer.max_steps": STAGES[stage].steps}
             chosen = dict(_flat(read_yaml(config))) if config else {}
             chosen = {key: value for key, value in chosen.items() if key not in ours}
@@ -233,5 +235,3 @@ def _flat(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
             yield from ((f"{group}.{key}", value) for key, value in inner.items())
         else:
             yield group, inner
-
-

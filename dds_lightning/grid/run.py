@@ -103,11 +103,13 @@ def do_nodes(asked: Asked, nodes: Mapping[str, Node]) -> dict[str, str]:
     progress.slots = engine.slots
     shown = on_terminal()
     try:
-        with progress_bar(("spinner", "bar", "count", "{task.description}"), len(todo), shown=shown, console=console) as bar:
+        with progress_bar(
+            ("spinner", "bar", "count", "{task.description}"), len(todo), shown=shown, console=console
+        ) as bar:
 
             def tell(line: str) -> None:
                 bar(completed=progress.done, description=line.rpartition("; ")[2] if "; " in line else "")
-                console.print(line)
+                console.print(line, soft_wrap=True)
 
             return run_nodes(todo, str(asked.out.absolute()), engine, progress, tell)
     finally:
@@ -133,9 +135,7 @@ def _table(study: Study, cells: Mapping[str, tuple[Cell, Node]], asked: Asked) -
     return {"format": 1, "study": asdict(study), "cells": rows, "command": command}
 
 
-def _planned(
-    asked: Asked, study: Study, cells: Mapping[str, tuple[Cell, Node]], nodes: Mapping[str, Node]
-) -> Report:
+def _planned(asked: Asked, study: Study, cells: Mapping[str, tuple[Cell, Node]], nodes: Mapping[str, Node]) -> Report:
     """What would be done."""
     done = {key for key in nodes if finished(asked.out / NODES / key) is not None}
     kinds: dict[str, int] = {}

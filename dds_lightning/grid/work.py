@@ -89,7 +89,9 @@ def evaluate(settings: Facts, how: Facts, reads: Reads, folder: Path, resuming: 
         if isinstance(actor, DDSAgent):
             actor = actor.variant(**acting, seed=settings["seed"])
         elif how["asked"]:
-            raise UserError(f"evaluate.{how['asked'][0]} is for agents over skills, which {method.title} has not: leave it out")
+            raise UserError(
+                f"evaluate.{how['asked'][0]} is for agents over skills, which {method.title} has not: leave it out"
+            )
         players.append(Contestant(name, actor, settings["episodes"]))
     result = rollout(task, players, seed=settings["seed"], workers=0)
     result.save(folder)

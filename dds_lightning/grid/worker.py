@@ -1,5 +1,7 @@
 """A worker process of the local engine: it reads jobs as lines of JSON and answers each with a line.
 
+It has one thread (`engines` sets OMP_NUM_THREADS): the workers are the parallelism.
+
 It is a plain `python -c` child, as those of `envs.pool`: it works from notebooks and scripts without a `__main__` guard,
 and ends, saving what it trains, when its caller does, because its input ends.
 """
@@ -25,7 +27,6 @@ def main() -> None:
     with caught():
         threading.Thread(target=_read, args=(jobs,), daemon=True).start()
         try:
-            _quiet_start()
             while line := jobs.get():
                 job = json.loads(line)
                 _log_to(Path(job["root"]) / LOGS / f"{job['key']}.txt")
@@ -41,16 +42,6 @@ def _read(jobs: queue.Queue[str]) -> None:
     for line in sys.stdin:
         jobs.put(line)
     os.kill(os.getpid(), signal.SIGTERM)
-
-
-def _quiet_start() -> None:
-    """One thread: the workers are the parallelism. What most jobs need is imported before the first arrives."""
-    import torch
-
-    from dds_lightning.training.fit import quieten
-
-    torch.set_num_threads(1)
-    quieten()
 
 
 def _log_to(path: Path) -> None:
