@@ -50,7 +50,7 @@ class DDSAgent(nn.Module):
         noise_scale: Factor on the decoder's noise; None takes the skill model's setting.
         fixed_codes: With `fixed`, environment e plays code `fixed_codes[e % len(fixed_codes)]`.
         seed: Seed of the random stream until `reset` is given one.
-        hold: Steps for which a skill is held before the next is chosen; None holds it for the H steps it was learnt for.
+        hold: Steps for which a skill is held before the next is chosen; None: for H steps, as it was learnt.
 
     Raises:
         UserError: The parts do not fit each other, or a setting is outside its range.

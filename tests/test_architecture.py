@@ -82,8 +82,8 @@ ROOMS = {
     "datamodules.relabelling datamodules.relabel datamodules.sources",
     "dds_lightning.grid": "agent baselines configs console envs errors online rollout saving study tasks training "
     "datamodules.collect datamodules.relabelled datamodules.relabelling datamodules.sources",
-    "dds_lightning.cli": "_version agent console errors grid interpret.draw online pipeline policy saving sharing skill "
-    "study tasks training datamodules.collect datamodules.inspection datamodules.listing datamodules.physics "
+    "dds_lightning.cli": "_version agent console errors grid interpret.draw online pipeline policy saving sharing "
+    "skill study tasks training datamodules.collect datamodules.inspection datamodules.listing datamodules.physics "
     "datamodules.relabel datamodules.relabelled datamodules.relabelling datamodules.sources",
     "dds_lightning.__main__": "cli",
 }

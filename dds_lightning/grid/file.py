@@ -181,9 +181,8 @@ def read_study(path: Path, scale: float = 1.0) -> Study:
         raise UserError(f"{path} is not a mapping, expected {', '.join(_KEYS)}")
     for key, value in found.items():
         if key not in _KEYS:
-            raise UserError(
-                f"{path}: {key} is no setting of a study{did_you_mean(str(key), _KEYS)}; they are {', '.join(_KEYS)}"
-            )
+            near = did_you_mean(str(key), _KEYS) or f", expected some of {', '.join(_KEYS)}"
+            raise UserError(f"{path}: {key} is no setting of a study{near}")
         if not isinstance(value, _KEYS[key]) or isinstance(value, bool):
             raise UserError(f"{path}: {key} is {value!r}, expected a {_KEYS[key][0].__name__}")
     for key in ("title", "tasks"):
@@ -223,8 +222,8 @@ def _check(study: Study) -> None:
         refuse_seed("seeds", seed)
     for method in study.methods:
         if method not in PLAYERS:
-            near = did_you_mean(str(method), PLAYERS)
-            raise UserError(f"methods: there is no method {method}{near}; there are {', '.join(PLAYERS)}")
+            near = did_you_mean(str(method), PLAYERS) or f", expected some of {', '.join(PLAYERS)}, or all"
+            raise UserError(f"methods: there is no method {method}{near}")
     for name in study.tasks:
         task = get_task(name)
         if study.data is None:
@@ -250,7 +249,8 @@ def _check(study: Study) -> None:
     for name, listed in (("rows", study.rows), ("columns", study.columns)):
         for one in listed:
             if one not in (known := ["task", "method", *study.grid, *(["variant"] if study.variants else [])]):
-                raise UserError(f"{name} names {one}{did_you_mean(one, known)}; the study has {', '.join(known)}")
+                near = did_you_mean(str(one), known) or f", expected some of {', '.join(known)}"
+                raise UserError(f"{name} names {one}, which the study has not{near}")
 
 
 def _asked(study: Study) -> dict[str, list[Any]]:
@@ -274,19 +274,16 @@ def _check_setting(key: str, value: Any, trained: set[str]) -> None:
     if room == "evaluate" or key in ("data.steps", "data.seed"):
         known = ["data.steps", "data.seed", *(f"evaluate.{one}" for one in EVALUATE)]
         if key not in known:
-            raise UserError(
-                f"{key} is no setting of the evaluation{did_you_mean(key, known)}; they are {', '.join(known)}"
-            )
+            near = did_you_mean(str(key), known) or f", expected some of {', '.join(known)}"
+            raise UserError(f"{key} is no setting of the data or the evaluation{near}")
         if not (value in ("greedy", "sample", "argmax_q", "random") if name == "selection" else _is_number(value)):
-            raise UserError(
-                f"{key} is {value!r}, expected {'greedy, sample, argmax_q or random' if name == 'selection' else 'a number'}"
-            )
+            expected = "greedy, sample, argmax_q or random" if name == "selection" else "a number"
+            raise UserError(f"{key} is {value!r}, expected {expected}")
         return
     if room not in STAGES or not name:
         known = [f"{stage}.{one}" for stage in trained for one in options(STAGES[stage])]
-        raise UserError(
-            f"{key} is no setting: write STAGE.KEY with a stage of {', '.join(sorted(trained))}{did_you_mean(key, known)}"
-        )
+        near = did_you_mean(key, known) or f": write STAGE.KEY with a stage of {', '.join(sorted(trained))}"
+        raise UserError(f"{key} is no setting{near}")
     if room not in trained:
         raise UserError(
             f"{key} is a setting of {room}, which no method of this study trains ({', '.join(sorted(trained))})"

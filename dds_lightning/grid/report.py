@@ -24,7 +24,7 @@ PAPERS = {
     "table2": "Laid out as the paper's table 2, which is for AntMaze-Large-Diverse.",
     "table3": "Laid out as the paper's table 3; its numbers beside a maze are for AntMaze-Large-Diverse.",
     "figure5": "Laid out as the paper's figure 5, which has curves and no numbers.",
-    "figure6": "Laid out as the paper's figure 6, which has curves and no numbers; the paper finds that H hardly matters.",
+    "figure6": "Laid out as the paper's figure 6, which has curves and no numbers; it finds that H hardly matters.",
 }
 
 
@@ -93,7 +93,9 @@ def _sections(results: Results) -> list[Section]:
         return [Section("", [*opening, "No cell is done yet."]), *_making(results)]
     sections = [Section("", opening), Section("Scores", [], results.table())]
     if cells["best"].notna().any():
-        told = "The best checkpoint was chosen by playing in the test environment while it trained: its score is optimistic."
+        told = (
+            "The best checkpoint was chosen by playing in the test environment while it trained: an optimistic score."
+        )
         sections.append(Section("The best checkpoint, apart", [told], results.table("best")))
     if study["paper"] == "figure6" and cells["horizon"].notna().any():
         sections.append(Section("Score over the horizon", [], None, figures.plot_horizon(cells), "horizon"))
@@ -114,9 +116,9 @@ def _statistics(results: Results) -> list[Section]:
     sections: list[Section] = []
     if len(comparison) > 1:
         told = (
-            "Interquartile mean (IQM) over seeds and tasks with its 95 % interval from a bootstrap stratified by task, and "
-            "the probability that a run of the setting beats one of the reference. With few seeds an interval is no "
-            "more than the range of what was seen: settings whose intervals overlap are not told apart here."
+            "Interquartile mean (IQM) over seeds and tasks with its 95 % interval from a bootstrap stratified by task, "
+            "and the probability that a run of the setting beats one of the reference. With few seeds an interval is "
+            "no more than the range of what was seen: settings whose intervals overlap are not told apart here."
         )
         numbers = comparison.round(2)
         sections.append(Section("Is it real?", [told], numbers, figures.plot_intervals(comparison), "intervals"))

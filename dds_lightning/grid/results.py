@@ -34,8 +34,9 @@ class Results:
         place: The study's folder.
         study: Its file, checked, as plain values.
         command: What made it.
-        cells: A row for each cell: coordinates, `seed`, `state`, `score` (normalised, of the last checkpoint), `best` (of the best checkpoint; NaN without one), `chosen` (how), `horizon`,
-            `hold`, `seconds` (of the evaluation and all that it reads), `key`, `commands`.
+        cells: A row for each cell: coordinates, `seed`, `state`, `score` (of the last checkpoint), `best` (of the best
+            checkpoint; NaN without one), `chosen` (how), `horizon`, `hold`, `seconds` (of the evaluation and all that
+            it reads), `key`, `commands`.
         episodes: Key -> scores of the last checkpoint's episodes.
         curves: Key -> what was reached while learning online: `env_steps` and `value`.
         made: Distinct versions, commits and machines.
@@ -86,6 +87,14 @@ class Results:
         """What the report calls an axis or a value."""
         return str(self.study["labels"].get(str(name), PLAYERS[name].title if name in PLAYERS else name))
 
+    def name(self, where: Mapping[str, Any]) -> str:
+        """A place in the grid, in words: values that speak for themselves without their axis."""
+        parts = (
+            value if axis in ("variant", "method", "task") else f"{self.label(axis)} {self.label(value)}"
+            for axis, value in where.items()
+        )
+        return ", ".join(map(self.label, parts))
+
     def layout(self) -> tuple[list[str], list[str]]:
         """Coordinates of the table's rows and of its columns: those of the file, and what it does not name."""
         rows, columns = list(self.study["rows"]), list(self.study["columns"])
@@ -105,10 +114,7 @@ class Results:
             where = dict(zip(rows + columns, chosen, strict=True))
             line = lines.setdefault(tuple(where[name] for name in rows), {})
             line |= {self.label(name): self.label(where[name]) for name in rows}
-            head = ", ".join(
-                f"{self.label(name)} {self.label(where[name])}".removeprefix("variant ") for name in columns
-            )
-            head = head or "score"
+            head = self.name({name: where[name] for name in columns}) or "score"
             line[head] = mean_std(part[measure].dropna())
             first = part.iloc[0]
             settings = {**self.study["settings"], **where}
@@ -123,10 +129,7 @@ class Results:
         axes = [axis for axis in (*self.layout()[0], *self.layout()[1]) if axis != "task"]
         found: dict[str, pd.DataFrame] = {}
         for chosen, part in self.cells.groupby(axes, sort=False, dropna=False) if axes else [((), self.cells)]:
-            where = zip(axes, chosen, strict=True)
-            name = ", ".join(
-                f"{self.label(axis)} {self.label(value)}".removeprefix("variant ") for axis, value in where
-            )
+            name = self.name(dict(zip(axes, chosen, strict=True)))
             scores = part.pivot_table(index="seed", columns="task", values="score", sort=False)
             if len(scores) and not scores.isna().any(axis=None):
                 found[name or "all"] = scores
@@ -136,7 +139,7 @@ class Results:
         """A row for each setting: interquartile mean with its interval, and how probably it beats the reference."""
         groups, rows = self.groups(), []
         reference = self.label(self.study["reference"] or BASE)
-        first = next((name for name in groups if name.removeprefix("method ") == reference), next(iter(groups), None))
+        first = next((name for name in groups if name == reference), next(iter(groups), None))
         for name, scores in groups.items():
             middle = interval(scores)
             row = {"setting": name, "runs": scores.size, "IQM": middle.value, "low": middle.low, "high": middle.high}
@@ -148,7 +151,7 @@ class Results:
         return table.rename(columns={"P(better)": f"P(better than {first})"}) if first else table
 
     def budgets(self) -> dict[str, NDArray[np.float64]]:
-        """Task and method -> score of the best setting that so many evaluation episodes find, see `evaluation_curve`."""
+        """Task and method -> score of the setting that so many evaluation episodes find, see `evaluation_curve`."""
         found = {}
         for (task, method), part in self.cells.groupby(["task", "method"], sort=False):
             runs = [self.episodes[key] for key in part["key"] if key in self.episodes]

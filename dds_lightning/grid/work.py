@@ -96,7 +96,8 @@ def evaluate(settings: Facts, how: Facts, reads: Reads, folder: Path, resuming: 
     result = rollout(task, players, seed=settings["seed"], workers=0)
     result.save(folder)
     rows = json.loads(result.summary().round(4).to_json(orient="records"))
-    flags = [f"--{stage}={path}" for stage, path in last.items()]
+    flags = [f"--skill={last['skill']}"] if "skill" in last else []
+    flags.append(f"--policy={last[method.stages[-1]]}")
     flags += [f"--{name}={value}" for name, value in acting.items()]
     told = " ".join(["dds evaluate", *flags, f"--task={task.name}", f"--episodes={settings['episodes']}"])
     told += f" --seed={settings['seed']}"

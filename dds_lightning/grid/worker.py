@@ -2,8 +2,8 @@
 
 It has one thread (`engines` sets OMP_NUM_THREADS): the workers are the parallelism.
 
-It is a plain `python -c` child, as those of `envs.pool`: it works from notebooks and scripts without a `__main__` guard,
-and ends, saving what it trains, when its caller does, because its input ends.
+It is a plain `python -c` child, as those of `envs.pool`: it works from notebooks and scripts without a `__main__`
+guard, and ends, saving what it trains, when its caller does, because its input ends.
 """
 
 from __future__ import annotations

@@ -11,8 +11,8 @@ Number = tuple[float, float | None]
 """Mean and standard deviation; None where only a mean is printed."""
 
 DATA_DIFFER = (
-    "The paper's numbers are for other data (D4RL's, in D4RL's physics) and longer trainings: they show which pattern to "
-    "expect, not which value."
+    "The paper's numbers are for other data (D4RL's, in D4RL's physics) and longer trainings: they show which pattern "
+    "to expect, not which value."
 )
 
 

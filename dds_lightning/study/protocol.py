@@ -43,8 +43,8 @@ def protocol(
     Returns:
         Plain values: `task` (with its variant), `environment`, `episodes`, `seed`, `checkpoint`, `noise_scale`
         (factor on the decoder's noise), `sampler` (of the decoder; None for one without noise), `temperature`,
-        `horizon` (steps for which a skill is held), `max_episode_steps`, `score_min` and `score_max` (returns that score 0
-        and 100), `paper_score` (None if the paper has none), `best` (None without one).
+        `horizon` (steps for which a skill is held), `max_episode_steps`, `score_min` and `score_max` (returns that
+        score 0 and 100), `paper_score` (None if the paper has none), `best` (None without one).
     """
     settings = agent.skill.hparams
     return {

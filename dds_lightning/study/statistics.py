@@ -1,6 +1,7 @@
-"""Is a difference real? Statistics over seeds and tasks (Agarwal et al. 2021, "Deep RL at the edge of the statistical
-precipice"), and what a score is worth when evaluations are counted (Jackson et al. 2025, "A clean slate for offline
-RL").
+"""Is a difference real? Statistics over seeds and tasks, and what a score is worth when evaluations are counted.
+
+After Agarwal et al. 2021, "Deep RL at the edge of the statistical precipice", and Jackson et al. 2025, "A clean slate
+for offline RL".
 
 Scores are arrays of shape (S, M): S seeds of M tasks. What draws random numbers takes a seed and gives the same every
 time.
@@ -91,7 +92,7 @@ def performance_profile(scores: ArrayLike, thresholds: ArrayLike) -> NDArray[np.
 def evaluation_curve(
     returns: ArrayLike, pulls: int, policies: int | None = 8, repeats: int = 200, alpha: float = 2.0, seed: int = 0
 ) -> NDArray[np.float64]:
-    """Score of the policy that one would deploy after so many evaluation episodes, chosen by an upper-confidence bandit.
+    """Score of the policy that one would deploy after so many evaluation episodes, spent by an upper-confidence bandit.
 
     An offline method leaves one policy for each of its settings; finding the best costs episodes in the environment. In
     each repeat some of the policies are arms, and a pull draws one of the arm's recorded episodes. Every arm is pulled

@@ -34,13 +34,11 @@ class Here:
         return future
 
 
-def chain(count, **of_last):
+def chain(count):
     """data -> two skills -> an evaluation each."""
     data = toy_node(0, count, kind="data")
     skills = [toy_node(index, count, reads=[data], kind="skill") for index in (1, 2)]
-    return in_order(
-        toy_node(10 + i, count, reads=[skill], **(of_last if i == 0 else {})) for i, skill in enumerate(skills)
-    )
+    return in_order(toy_node(10 + i, count, reads=[skill]) for i, skill in enumerate(skills))
 
 
 def run(nodes, root, engine=None):

@@ -26,8 +26,14 @@ def test_a_cell_is_printed_as_the_paper_prints_it(scores, text):
 
 @pytest.mark.parametrize(
     ("method", "family", "printed"),
-    [("DDS", "halfcheetah hopper walker2d", 79.3), ("IQL", "halfcheetah hopper walker2d", 77.0)]
-    + [("DDS", "antmaze", 88.7), ("IQL", "antmaze", 63.0), ("DQL", "antmaze", 69.6), ("DDS", "kitchen", 66.3)],
+    [
+        ("DDS", "halfcheetah hopper walker2d", 79.3),
+        ("IQL", "halfcheetah hopper walker2d", 77.0),
+        ("DDS", "antmaze", 88.7),
+        ("IQL", "antmaze", 63.0),
+        ("DQL", "antmaze", 69.6),
+        ("DDS", "kitchen", 66.3),
+    ],
 )
 def test_the_papers_averages_follow_from_its_rows(method, family, printed):
     rows = [row[method] for task, row in TABLE1.items() if task.split("-")[0] in family.split()]
