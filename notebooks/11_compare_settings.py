@@ -18,8 +18,8 @@
 #
 # **Time:** about five minutes on two CPU cores. No network, no GPU, no graphics driver.
 #
-# A score of one training is an anecdote: with another seed the same settings may do much better or worse. Whoever wants
-# to know whether a setting matters trains every value of it with several seeds, and looks at the intervals.
+# A score of one training is an anecdote: with another seed the same settings may do much better or worse. Whoever
+# wants to know whether a setting matters trains every value of it with several seeds, and looks at the intervals.
 
 # %%
 # %matplotlib inline
@@ -44,9 +44,9 @@ RUNS = Path("../runs/notebooks/11")  # what this notebook writes lies here
 # %% [markdown]
 # ## The question as a file
 #
-# `tasks`, `seeds` and `grid` span the cells. Settings are those of `dds skill fit` and `dds policy fit` with the stage in
-# front, so everything that can be set can be asked about. Everything that is not named is the preset's. The budgets here
-# are tiny, so that the answer comes within minutes; for your own data add `data: local:FOLDER`.
+# `tasks`, `seeds` and `grid` span the cells. Settings are those of `dds skill fit` and `dds policy fit` with the
+# stage in front, so everything that can be set can be asked about. Everything that is not named is the preset's. The
+# budgets here are tiny, so that the answer comes within minutes; for your own data add `data: local:FOLDER`.
 
 # %%
 RUNS.mkdir(parents=True, exist_ok=True)
@@ -69,13 +69,13 @@ labels: {{skill.model.num_skills: K}}
 )
 main(["study", "run", str(study_file), "--out", str(RUNS), "--plan"])
 # %% [markdown]
-# The plan shows what is shared: one data set serves all cells. A piece of work is named by the hash of its settings and
-# of what it reads; whatever two cells have in common is done once, also across study files in the same folder.
+# The plan shows what is shared: one data set serves all cells. A piece of work is named by the hash of its settings
+# and of what it reads; whatever two cells have in common is done once, also across study files in the same folder.
 #
 # ## Run it
 #
-# On a terminal this is `dds study run does_k_matter.yaml`. Stop it at any time: what is finished is kept, and a training
-# goes on from its last checkpoint. On a cluster, add `--engine ray` or `--engine slurm`.
+# On a terminal this is `dds study run does_k_matter.yaml`. Stop it at any time: what is finished is kept, and a
+# training goes on from its last checkpoint. On a cluster, add `--engine ray` or `--engine slurm`.
 
 # %%
 status = main(["study", "run", str(study_file), "--out", str(RUNS)])
@@ -101,13 +101,13 @@ display(comparison.round(2).style.hide(axis="index"))
 display(figures.plot_intervals(comparison))
 
 # %% [markdown]
-# **How to read it.** If the intervals overlap, this study cannot tell the two apart: that is not the same as "K does not
-# matter". Look at the probability, too: 0.5 is a coin, and its interval says how sure that is.
+# **How to read it.** If the intervals overlap, this study cannot tell the two apart: that is not the same as "K does
+# not matter". Look at the probability, too: 0.5 is a coin, and its interval says how sure that is.
 #
 # ## Would more seeds help?
 #
-# An interval shrinks with the number of seeds, roughly with its square root. Drawing seeds from those that we have shows
-# how wide it would be with more of them, if they scattered as these do.
+# An interval shrinks with the number of seeds, roughly with its square root. Drawing seeds from those that we have
+# shows how wide it would be with more of them, if they scattered as these do.
 
 # %%
 first = next(iter(results.groups().values()))

@@ -140,7 +140,7 @@ class RayTasks:
             ray.init(
                 log_to_driver=False,
                 configure_logging=False,
-                **({} if "RAY_ADDRESS" in os.environ else {"num_cpus": workers}),
+                **({} if "RAY_ADDRESS" in os.environ else {"num_cpus": workers, "include_dashboard": False}),
             )
         # A worker that is lost is Ray's to replace; an error of ours is an answer, and not tried again.
         self._do = ray.remote(max_retries=TRIES - 1, num_cpus=cpus, num_gpus=gpus)(do)
