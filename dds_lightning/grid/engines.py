@@ -199,7 +199,8 @@ class Slurm:
                 f"--engine is slurm, and submitit finds no Slurm here ({error}): run it on a login node"
             ) from None
         self._executor.update_parameters(timeout_min=minutes, cpus_per_task=cpus, gpus_per_node=gpus, name="dds-study")
-        self._threads, self._jobs, self.closed = ThreadPoolExecutor(self.slots), [], False
+        self._threads, self.closed = ThreadPoolExecutor(self.slots), False
+        self._jobs: list[Any] = []
 
     def submit(self, job: Job) -> Future[Answer]:
         """As `Engine.submit`."""

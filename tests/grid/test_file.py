@@ -101,7 +101,7 @@ def test_a_wrong_study_is_answered_in_one_sentence(tmp_path, keys, message):
 
 
 def test_wrong_scales_and_files_are_refused(tmp_path, dds):
-    with pytest.raises(UserError, match="--scale is 0.0, expected more than 0"):
+    with pytest.raises(UserError, match=r"--scale is 0\.0, expected more than 0"):
         study(tmp_path, 0.0)
     answer = dds("study", "run", "tabel2")
     assert answer.status == 2
