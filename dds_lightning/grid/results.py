@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ from dds_lightning.grid.file import BASE, PLAYERS
 from dds_lightning.grid.job import MADE, NODES
 from dds_lightning.saving.arrays import read_parquet
 from dds_lightning.saving.run_directory import Done, finished, read_marker
-from dds_lightning.saving.untrusted import TEXT, conform, mapping, read_csv, read_json
+from dds_lightning.saving.untrusted import TEXT, conform, mapping, parsing, read_csv, read_json
 from dds_lightning.study.paper import number_of
 from dds_lightning.study.protocol import BEST, LAST
 from dds_lightning.study.statistics import evaluation_curve, interval, mean_std, probability_of_improvement
@@ -62,12 +63,19 @@ class Results:
         file = place / "cells.json"
         if not file.is_file():
             raise UserError(f"{place} holds no study: there is no {file.name}; give OUT/NAME of `dds study run`")
+        with parsing(file, "run the study again"):
+            return cls._read(place, file)
+
+    @classmethod
+    def _read(cls, place: Path, file: Path) -> Results:
         found = mapping(read_json(file, 64 * TEXT, root=place), file)
         conform(found, {"study": (dict,), "cells": (list,), "command": (str,)}, str(file))
         nodes, seen = place.parent / NODES, dict[str, Done | None]()
         rows, episodes, curves, made = [], {}, {}, dict[str, dict[str, Any]]()
         for cell in found["cells"]:
             for key in cell["nodes"]:
+                if not re.fullmatch(r"[a-z0-9_]+-[0-9a-f]{16}", str(key)):
+                    raise UserError(f"{file}: {key!r} is no name of a job: run the study again")
                 if key not in seen:
                     seen[key] = finished(nodes / key)
                     if (nodes / key / MADE).is_file():

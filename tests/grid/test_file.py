@@ -78,13 +78,13 @@ def test_packaged_studies_can_be_planned(name):
         ({"seeds": [0.5]}, "seeds holds 0.5, expected whole numbers"),
         (
             {"grid": {"skill.model.num_skils": [4]}},
-            r"--skill.model.num_skils is not an option of `dds skill fit`: did you mean --skill.model.num_skills\?",
+            r"--skill.model.num_skils is not an option of `dds skill fit`: did you mean --skill.model.num_skills or",
         ),
         ({"settings": {"skill.model.num_skills": "many"}}, "num_skills is many, expected a whole number"),
         ({"settings": {"skil.model.num_skills": 4}}, r"is no setting: did you mean skill.model.num_skills"),
         ({"settings": {"clone.model.lr": 0.1}}, "clone.model.lr is a setting of clone, which no method of this study"),
         ({"settings": {"policy.data.skill": "x.ckpt"}}, "policy.data.skill is set by the study itself"),
-        ({"settings": {"evaluate.noise": 0.5}}, r"evaluate.noise is no setting .*did you mean evaluate.noise_scale\?"),
+        ({"settings": {"evaluate.noise": 0.5}}, r"evaluate.noise is no setting .*did you mean evaluate.noise_scale or"),
         ({"settings": {"evaluate.selection": "best"}}, "evaluate.selection is 'best', expected greedy, sample"),
         ({"variants": {"same": {"skill.model.skill_dim": 64}}}, "two cells are the same, .* and '.*same"),
         ({"variants": {"base": {"skill.model.skill_dim": 32}}}, "base is there without being named"),
@@ -105,5 +105,5 @@ def test_wrong_scales_and_files_are_refused(tmp_path, dds):
         study(tmp_path, 0.0)
     answer = dds("study", "run", "tabel2")
     assert answer.status == 2
-    assert "there is no file tabel2: did you mean table2?" in answer.err
+    assert "there is no file tabel2: did you mean table2 or table3?" in answer.err
     assert dds("study", "report", tmp_path).err.count("holds no study") == 1
