@@ -154,5 +154,5 @@ def test_a_damaged_study_is_told_in_a_sentence(tmp_path, change):
     place = made(tmp_path, left_out=range(12))
     file = place / CELLS
     file.write_text(change(file.read_text()))
-    with pytest.raises(UserError, match="cells.json"):
+    with pytest.raises(UserError, match=r"cells\.json"):
         report_study(place)
