@@ -9,6 +9,7 @@ import subprocess
 import time
 import traceback
 from collections.abc import Mapping
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -62,6 +63,7 @@ def do(job: Job) -> dict[str, Any]:
     return {"seconds": time.monotonic() - started, "error": None}
 
 
+@cache
 def provenance() -> dict[str, Any]:
     """By what a result was made: versions, the commit where there is a checkout, the machine."""
     versions = {"python": platform.python_version()}
