@@ -50,6 +50,7 @@ class DDSAgent(nn.Module):
         noise_scale: Factor on the decoder's noise; None takes the skill model's setting.
         fixed_codes: With `fixed`, environment e plays code `fixed_codes[e % len(fixed_codes)]`.
         seed: Seed of the random stream until `reset` is given one.
+        hold: Steps for which a skill is held before the next is chosen; None: for H steps, as it was learnt.
 
     Raises:
         UserError: The parts do not fit each other, or a setting is outside its range.
@@ -64,14 +65,15 @@ class DDSAgent(nn.Module):
         noise_scale: float | None = None,
         fixed_codes: ArrayLike | None = None,
         seed: int = 0,
+        hold: int | None = None,
     ) -> None:
-        """Put the parts together."""
         super().__init__()
         self.skill: SkillModule = skill  # type: ignore[assignment]  # what shows codes asks for the kinds it can show
         self.policy: PolicyModule | None = policy  # type: ignore[assignment]
         self.discrete = bool(getattr(skill, "discrete", True))
         self.selection, self.temperature, self._noise_scale = selection, float(temperature), noise_scale
         self.horizon, self.num_skills = int(skill.horizon), int(skill.num_skills) if self.discrete else 0
+        self.hold = self.horizon if hold is None else int(hold)
         self.observation_dim = int(skill.hparams["observation_dim"])
         self.action_dim = int(skill.hparams["action_dim"])
         self.fixed_codes = None if fixed_codes is None else np.asarray(fixed_codes, dtype=np.int64)
@@ -91,6 +93,8 @@ class DDSAgent(nn.Module):
             raise UserError(f"temperature is {self.temperature}, expected more than 0 ('greedy' is the limit)")
         if self._noise_scale is not None and not 0 <= self._noise_scale < np.inf:
             raise UserError(f"noise_scale is {self._noise_scale}, expected 0 or more")
+        if not 1 <= self.hold <= self.horizon:
+            raise UserError(f"hold is {self.hold}, expected 1 to {self.horizon}, the steps that these skills last")
         if self.policy is None and self.selection not in ("random", "fixed"):
             raise UserError(f"selection '{self.selection}' needs a policy; use 'random' or 'fixed' without")
         if (self.selection == "fixed") != (codes is not None):
@@ -101,9 +105,8 @@ class DDSAgent(nn.Module):
             theirs: Any = {"num_skills": getattr(self.policy, "num_skills", None), **self.policy.hparams}
             for name in ("num_skills", "observation_dim"):
                 if (mine := getattr(self, name)) != (other := theirs[name]):
-                    raise UserError(
-                        f"{name} is {mine} in the skill model and {other} in the policy: they do not belong together"
-                    )
+                    told = f"{name} is {mine} in the skill model and {other} in the policy"
+                    raise UserError(f"{told}: they do not belong together")
             learnt_with = self.policy.hparams.get("skill_hash")
             if learnt_with and learnt_with != (found := self.skill.fingerprint()):
                 raise UserError(
@@ -119,11 +122,11 @@ class DDSAgent(nn.Module):
 
         Args:
             selection: As in the constructor; this agent's by default.
-            **settings: `temperature`, `noise_scale`, `fixed_codes`, `seed`, as in the constructor.
+            **settings: `temperature`, `noise_scale`, `fixed_codes`, `seed`, `hold`, as in the constructor.
         """
         selection = selection or self.selection
         given: dict[str, Any] = {"temperature": self.temperature, "noise_scale": self._noise_scale, "seed": self._seed}
-        given["fixed_codes"] = self.fixed_codes if selection == "fixed" else None
+        given |= {"fixed_codes": self.fixed_codes if selection == "fixed" else None, "hold": self.hold}
         return DDSAgent(self.skill, self.policy, selection, **{**given, **settings})
 
     @property
@@ -211,10 +214,8 @@ class DDSAgent(nn.Module):
         """
         observations = numbers(observations)
         if observations.ndim != 2 or observations.shape[1] != self.observation_dim:
-            raise UserError(
-                f"observations are {observations.shape}, expected (environments, {self.observation_dim}): this "
-                "agent was trained on another environment, or the observations are not flat"
-            )
+            told = f"observations are {observations.shape}, expected (environments, {self.observation_dim})"
+            raise UserError(f"{told}: this agent was trained on another environment, or the observations are not flat")
         return torch.from_numpy(np.ascontiguousarray(observations)).to(self.device)
 
     def choose(self, observations: Tensor, restarted: NDArray[np.bool_] | None, rows: NDArray[np.intp]) -> NDArray[Any]:
@@ -227,7 +228,7 @@ class DDSAgent(nn.Module):
             late = rows[due]
             chosen = observations if due.all() else observations[torch.from_numpy(due).to(observations.device)]
             self._codes[late] = self._pick(chosen, late)
-            self._clock[late], self._decided[late] = self.horizon, True
+            self._clock[late], self._decided[late] = self.hold, True
         self._clock[rows] -= 1
         return self._codes[rows]
 
@@ -287,8 +288,7 @@ class DDSAgent(nn.Module):
         if self.policy is not None and self.discrete:
             answers["logits"] = self.policy.eval().logits(observations).nan_to_num(neginf=0.0)
         elif self.policy is not None:
-            policy: Any = self.policy.eval()
-            answers["choices"] = policy.choose(observations, "greedy")
+            answers["choices"] = self.policy.eval().choose(observations, "greedy")  # type: ignore[operator]
         return {name: [[round(x, 6) for x in row] for row in answer.tolist()] for name, answer in answers.items()}
 
     def save(
@@ -318,6 +318,7 @@ class DDSAgent(nn.Module):
         modules: Any = {part.STAGE: part for part in self.children() if hasattr(part, "STAGE")}  # not of raw actions
         acting = {"selection": self.selection, "temperature": self.temperature, "noise_scale": self._noise_scale}
         acting["fixed_codes"] = None if self.fixed_codes is None else self.fixed_codes.tolist()
+        acting |= {} if self.hold == self.horizon else {"hold": self.hold}
         return publish(directory, modules, {**about, "agent": acting, "golden": self.golden()}, metrics, card)
 
     @classmethod
@@ -326,7 +327,7 @@ class DDSAgent(nn.Module):
 
         Args:
             directory: As written by `save` or `dds run`, or `hf:OWNER/NAME` on the Hub.
-            **settings: Override `selection`, `temperature`, `noise_scale`, `fixed_codes`, `seed`.
+            **settings: Override `selection`, `temperature`, `noise_scale`, `fixed_codes`, `seed`, `hold`.
 
         Raises:
             UserError: Files are missing, changed, of a newer version, or do not fit; the message names them.

@@ -92,6 +92,25 @@ def test_a_skill_lasts_h_steps_counted_from_each_environments_own_reset():
     assert [count for count, _, _ in policy.asked] == [3, 3, 1, 2, 1, 2]
 
 
+def test_a_skill_may_be_held_for_fewer_steps_than_it_was_learnt_for():
+    agent = DDSAgent(CodeSkill(), StatePolicy(), "greedy", hold=2)
+    agent.reset(1)
+    acted = [float(agent.act(observe(step % K))[0, 0]) for step in range(6)]
+    assert acted == [0, 0, 2, 2, 0, 0]  # a new choice every second step, where H = 3 would give 0 0 0 3 3 3
+    assert agent.variant("random").hold == 2
+    for hold in (0, H + 1):
+        with pytest.raises(UserError, match=f"hold is {hold}, expected 1 to 3, the steps that these skills last"):
+            DDSAgent(CodeSkill(), StatePolicy(), "greedy", hold=hold)
+
+
+def test_how_long_a_skill_is_held_is_saved_where_it_differs_from_h(tmp_path):
+    for hold, kept in ((2, {"hold": 2}), (5, {})):
+        place = DDSAgent(*tiny_modules(), hold=hold).save(tmp_path / str(hold))
+        config = yaml.safe_load((place / "config.yaml").read_text())["agent"]
+        assert {key: value for key, value in config.items() if key == "hold"} == kept
+        assert DDSAgent.load(place).hold == hold
+
+
 def test_rows_that_are_left_out_keep_their_clock():
     agent = DDSAgent(CodeSkill(), StatePolicy(), "greedy")
     agent.reset(3)

@@ -21,7 +21,7 @@ from dds_lightning.saving.files import DISK_ERRORS, expand
 from dds_lightning.training.stages import STAGES
 
 USAGE_ERROR = 2
-GOES_ON = ("run", "relabel", "online compare", "data collect", "data fetch")
+GOES_ON = ("run", "relabel", "online compare", "study run", "data collect", "data fetch")
 """Commands that detect what an earlier, interrupted call has already done."""
 
 

@@ -144,6 +144,7 @@ def evaluate(
     selection: list[str] = ["greedy", "sample"],  # noqa: B006
     temperature: float = 1.0,
     noise_scale: float | None = None,
+    hold: int | None = None,
     checkpoint: Literal["last", "best", "both"] = "both",
     seed: int = 0,
     workers: int | None = None,
@@ -171,6 +172,7 @@ def evaluate(
         selection: How skills are chosen: greedy, sample, argmax_q, random; several give one row each.
         temperature: Temperature of `sample`; below 1 is nearer to greedy.
         noise_scale: Factor on the decoder's noise; without it the agent's.
+        hold: Steps for which a skill is held before the next is chosen; without it the agent's, H for most.
         checkpoint: Which of a run's checkpoints; both means the last and, where the run kept one, the best.
         seed: Seed of the environments and of sampling.
         workers: Number of processes for the environments; without it one per core.
@@ -191,6 +193,7 @@ def evaluate(
         selection=selection,
         temperature=temperature,
         noise_scale=noise_scale,
+        hold=hold,
         checkpoint=checkpoint,
         seed=seed,
         workers=workers,

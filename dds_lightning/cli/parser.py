@@ -8,7 +8,7 @@ from typing import Any, Literal
 import docstring_parser
 from jsonargparse import ArgumentParser
 
-from dds_lightning.cli import atlas, checkpoints, commands, data, online, record
+from dds_lightning.cli import atlas, checkpoints, commands, data, online, record, study
 from dds_lightning.cli.completion import script
 from dds_lightning.console.arguments import as_lists, list_options
 from dds_lightning.console.reports import Report
@@ -21,6 +21,7 @@ GROUPS = {
     "data": "List, show, check, fetch and collect data sets.",
     "checkpoints": "List and verify published agents.",
     "online": STAGES["online"].description,
+    "study": "Run a grid over tasks, methods, settings and seeds, and report it with intervals.",
 }
 OPTIONAL_POSITIONALS: dict[Callable[..., Any], tuple[str, str]] = {
     commands.tasks: ("name", "?"),
@@ -42,6 +43,7 @@ def command_table() -> Commands:
         "relabel": commands.relabel,
         "evaluate": commands.evaluate,
         "report": commands.report,
+        "study": {"run": study.run, "report": study.report},
         "atlas": atlas.atlas,
         "record": record.record,
         "data": {

@@ -90,6 +90,7 @@ class Published:
             "temperature": (int, float),
             "noise_scale": (int, float),
             "seed": int,
+            "hold": int,
         }
         for name, value in chosen.items():
             if value is not None and name in known and (not isinstance(value, known[name]) or isinstance(value, bool)):

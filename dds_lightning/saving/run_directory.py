@@ -247,6 +247,12 @@ def read_marker(folder: Path) -> dict[str, Any]:
     return value
 
 
+def finished(folder: Path) -> Done | None:
+    """The step in a folder, if it was finished, whatever its settings, and its outputs have not changed."""
+    marker = read_marker(folder)
+    return _found(folder, marker) if marker.get("state") == "finished" else None
+
+
 def _check_marker(marker: Mapping[str, Any], folder: Path) -> None:
     """Refuse a marker that no step wrote, or whose outputs lie outside of the run."""
     what = str(folder / MARKER)

@@ -29,6 +29,7 @@ def evaluate(
     selection: str | Sequence[str] = ("greedy", "sample"),
     temperature: float = 1.0,
     noise_scale: float | None = None,
+    hold: int | None = None,
     checkpoint: Literal["last", "best", "both"] = "both",
     seed: int = 0,
     workers: int | None = None,
@@ -56,7 +57,8 @@ def evaluate(
     count = wanted.evaluation_episodes if episodes is None else episodes
     if count < 1:
         raise UserError(f"--episodes is {count}, expected at least 1")
-    acting: dict[str, Any] = {"seed": seed, **({} if noise_scale is None else {"noise_scale": noise_scale})}
+    chosen = {"noise_scale": noise_scale, "hold": hold}
+    acting: dict[str, Any] = {"seed": seed, **{name: value for name, value in chosen.items() if value is not None}}
     agents = {
         kind: loose_agent(skill, policy, **acting) if skill else DDSAgent.load(place, **acting)
         for kind, place in places.items()

@@ -43,8 +43,8 @@ def protocol(
     Returns:
         Plain values: `task` (with its variant), `environment`, `episodes`, `seed`, `checkpoint`, `noise_scale`
         (factor on the decoder's noise), `sampler` (of the decoder; None for one without noise), `temperature`,
-        `horizon` (steps of a skill), `max_episode_steps`, `score_min` and `score_max` (returns that score 0
-        and 100), `paper_score` (None if the paper has none), `best` (None without one).
+        `horizon` (steps for which a skill is held), `max_episode_steps`, `score_min` and `score_max` (returns that
+        score 0 and 100), `paper_score` (None if the paper has none), `best` (None without one).
     """
     settings = agent.skill.hparams
     return {
@@ -56,7 +56,7 @@ def protocol(
         "noise_scale": agent.noise_scale,
         "sampler": settings["sampler"] if settings.get("decoder") == "diffusion" else None,
         "temperature": temperature,
-        "horizon": agent.horizon,
+        "horizon": agent.hold,
         "max_episode_steps": task.max_episode_steps,
         "score_min": task.score_min,
         "score_max": task.score_max,

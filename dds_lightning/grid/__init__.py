@@ -1,0 +1,1 @@
+"""`dds study`: a grid over tasks, methods, settings and seeds, each piece of work done once, on any engine."""

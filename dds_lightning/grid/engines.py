@@ -1,0 +1,238 @@
+"""Where the jobs of a study run: processes on this machine, a Ray cluster, or Slurm by submitit.
+
+An engine turns a job into a `Future` of its answer; order, sharing and what is done already are `loop`'s.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, Protocol
+
+from dds_lightning.errors import UserError, lacks_extra
+from dds_lightning.grid.job import Job, do
+
+Answer = dict[str, Any]
+TRIES = 3
+"""How often a job is begun whose process dies under it; each time it goes on from its last checkpoint."""
+_START = "from dds_lightning.grid.worker import main; main()"
+
+
+class Engine(Protocol):
+    """Runs jobs."""
+
+    slots: int
+    """Jobs that are worth submitting at once."""
+
+    def submit(self, job: Job) -> Future[Answer]:
+        """Begin a job; the future's exception means that the engine lost it."""
+        ...
+
+    def close(self) -> None:
+        """Stop what is running; it goes on from its last checkpoint the next time."""
+
+
+class Local:
+    """Worker processes of one thread each, which are kept from job to job.
+
+    Args:
+        workers: How many.
+    """
+
+    def __init__(self, workers: int) -> None:
+        self.slots, self.closed = workers, False
+        self._threads = ThreadPoolExecutor(workers)
+        self._idle: queue.LifoQueue[_Worker] = queue.LifoQueue()
+        self._workers: list[_Worker] = []
+
+    def submit(self, job: Job) -> Future[Answer]:
+        """As `Engine.submit`."""
+        return self._threads.submit(self._do, job)
+
+    def _do(self, job: Job) -> Answer:
+        status = 0
+        for _ in range(TRIES):
+            if self.closed:
+                return {"seconds": 0.0, "error": "stopped"}
+            worker = self._worker()
+            answer = worker.ask(job)
+            if answer is not None:
+                self._idle.put(worker)
+                return answer
+            self._workers.remove(worker)
+            status = worker.process.wait()
+        died = f"its process died {TRIES} times, the last time with status {status}"
+        return {"seconds": 0.0, "error": f"{died}; most likely there is too little memory: ask for fewer --workers"}
+
+    def _worker(self) -> _Worker:
+        try:
+            return self._idle.get_nowait()
+        except queue.Empty:
+            worker = _Worker()
+            self._workers.append(worker)
+            return worker
+
+    def close(self) -> None:
+        """As `Engine.close`."""
+        self.closed = True
+        for worker in list(self._workers):
+            worker.end()
+        self._threads.shutdown(cancel_futures=True)
+
+
+class _Worker:
+    """One process that answers jobs."""
+
+    def __init__(self) -> None:
+        path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
+        threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+        self.process = subprocess.Popen(  # noqa: S603 - this Python and a constant program, no shell
+            [sys.executable, "-P", "-c", _START],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env={**os.environ, **threads, "PYTHONPATH": path},
+            text=True,
+            process_group=0,  # Ctrl-C is the caller's, who asks the workers to save
+        )
+
+    def ask(self, job: Job) -> Answer | None:
+        """Its answer; None if the process died."""
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        try:
+            self.process.stdin.write(json.dumps(job) + "\n")
+            self.process.stdin.flush()
+        except OSError:
+            return None
+        line = self.process.stdout.readline()
+        return json.loads(line) if line.endswith("\n") else None
+
+    def end(self) -> None:
+        """Let it save and end; its thread sees the end of its output."""
+        self.process.terminate()
+        try:
+            self.process.wait(60)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+
+
+class RayTasks:
+    """Ray core tasks, on this machine or on the cluster that RAY_ADDRESS names.
+
+    Args:
+        workers: Tasks at once; None submits all that are ready.
+        cpus: Of each task.
+        gpus: Of each task; may be a fraction.
+    """
+
+    def __init__(self, workers: int | None, cpus: float = 1, gpus: float = 0) -> None:
+        ray = _package("ray", "--engine=ray needs Ray", "ray")
+        self.ray, self.slots = ray, workers or 1000
+        if not ray.is_initialized():
+            ray.init(
+                log_to_driver=False,
+                configure_logging=False,
+                **({} if "RAY_ADDRESS" in os.environ else {"num_cpus": workers, "include_dashboard": False}),
+            )
+        # A worker that is lost is Ray's to replace; an error of ours is an answer, and not tried again.
+        self._do = ray.remote(max_retries=TRIES - 1, num_cpus=cpus, num_gpus=gpus)(do)
+
+    def submit(self, job: Job) -> Future[Answer]:
+        """As `Engine.submit`."""
+        future: Future[Answer] = self._do.remote(dict(job)).future()
+        return future
+
+    def close(self) -> None:
+        """As `Engine.close`."""
+        self.ray.shutdown()
+
+
+class Requeued:
+    """A job that Slurm may preempt: it is put back in the queue and goes on from its last checkpoint."""
+
+    def __call__(self, job: Job) -> Answer:
+        """Do it."""
+        return do(job)
+
+    def checkpoint(self, job: Job) -> Any:
+        """What submitit submits again after a preemption or a timeout."""
+        import submitit
+
+        return submitit.helpers.DelayedSubmission(self, job)
+
+
+class Slurm:
+    """One Slurm job for each job, by submitit.
+
+    Args:
+        folder: Of submitit's files, on a file system that all nodes see.
+        workers: Jobs in the queue at once; None means 100.
+        cpus: Of each job.
+        gpus: Of each job.
+        minutes: Time limit of each job; one that needs longer is put back in the queue.
+        cluster: `slurm`, or submitit's `local` for a trial.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        workers: int | None,
+        cpus: int = 1,
+        gpus: int = 0,
+        minutes: int = 240,
+        cluster: str = "slurm",
+    ) -> None:
+        submitit = _package("submitit", "--engine=slurm needs submitit", "slurm")
+        self.slots = workers or 100
+        try:
+            self._executor = submitit.AutoExecutor(folder / "%j", cluster=cluster)
+        except RuntimeError as error:
+            raise UserError(
+                f"--engine is slurm, and submitit finds no Slurm here ({error}): run it on a login node"
+            ) from None
+        self._executor.update_parameters(timeout_min=minutes, cpus_per_task=cpus, gpus_per_node=gpus, name="dds-study")
+        self._threads, self.closed = ThreadPoolExecutor(self.slots), False
+        self._jobs: list[Any] = []
+
+    def submit(self, job: Job) -> Future[Answer]:
+        """As `Engine.submit`."""
+        submitted = self._executor.submit(Requeued(), dict(job))
+        self._jobs.append(submitted)
+        return self._threads.submit(self._wait, submitted)
+
+    def _wait(self, submitted: Any) -> Answer:
+        while not (self.closed or submitted.done()):
+            time.sleep(0.5)
+        if self.closed:
+            return {"seconds": 0.0, "error": "stopped"}
+        answer: Answer = submitted.result()
+        return answer
+
+    def close(self) -> None:
+        """As `Engine.close`: what is queued or running is cancelled."""
+        self.closed = True
+        for submitted in self._jobs:
+            if not submitted.done():
+                submitted.cancel()
+        self._threads.shutdown(cancel_futures=True)
+
+
+ENGINES: dict[str, Callable[..., Engine]] = {"local": Local, "ray": RayTasks, "slurm": Slurm}
+"""Name -> engine; `run` gives each its arguments."""
+
+
+def _package(name: str, what: str, extra: str) -> Any:
+    import importlib
+
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise lacks_extra(what, extra) from None

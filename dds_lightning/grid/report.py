@@ -1,0 +1,190 @@
+"""`dds study report`: one self-contained page and Markdown, laid out as the paper's tables and figures."""
+
+from __future__ import annotations
+
+import base64
+import io
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from dds_lightning.console.reports import Report, table
+from dds_lightning.grid import figures
+from dds_lightning.grid.results import PULLS, Results
+from dds_lightning.saving.files import written_whole
+from dds_lightning.saving.run_directory import duration
+from dds_lightning.saving.templates import render
+from dds_lightning.study.paper import DATA_DIFFER
+from dds_lightning.study.tables import markdown
+
+PAPERS = {
+    "table1": "Laid out as the paper's table 1.",
+    "table2": "Laid out as the paper's table 2, which is for AntMaze-Large-Diverse.",
+    "table3": "Laid out as the paper's table 3; its numbers beside a maze are for AntMaze-Large-Diverse.",
+    "figure5": "Laid out as the paper's figure 5, which has curves and no numbers.",
+    "figure6": "Laid out as the paper's figure 6, which has curves and no numbers; it finds that H hardly matters.",
+}
+
+
+@dataclass
+class Section:
+    """A part of the report: text, a table, a figure, commands."""
+
+    title: str
+    lines: list[str] = field(default_factory=list)
+    table: pd.DataFrame | None = None
+    figure: Any = None
+    name: str = ""
+    commands: list[tuple[str, list[str]]] = field(default_factory=list)
+
+
+def report_study(place: Path) -> Report:
+    """Write `report/` in a study's folder, and return what is in it; a study that is not finished has one too.
+
+    Raises:
+        UserError: No study is there, or a file is damaged.
+    """
+    results = Results.read(place)
+    sections, folder = _sections(results), place / "report"
+    pictures = {section.name: _png(section.figure) for section in sections if section.figure is not None}
+    for name, picture in pictures.items():
+        with written_whole(folder / f"{name}.png") as part:
+            part.write_bytes(picture)
+    page = render("dds_lightning.grid", "page.html.jinja", _values(results, sections, pictures))
+    cells = results.cells.drop(columns=["commands", "key"])
+    for file, text in {
+        "report.md": _markdown(results, sections),
+        "index.html": page,
+        "cells.csv": cells.to_csv(index=False, lineterminator="\n"),
+    }.items():
+        with written_whole(folder / file) as part:
+            part.write_text(text, encoding="utf-8")
+    comparison = results.comparison()
+    told: list[Any] = [table(results.table(), str(results.study["title"]))]
+    told += [table(comparison)] if len(comparison) > 1 else []
+    told += [_progress(results), f"report: {folder / 'index.html'}"]
+    data = {"study": place, "report": folder / "index.html", "table": cells, "comparison": comparison}
+    return Report(data, told)
+
+
+def _progress(results: Results) -> str:
+    done = int((results.cells["state"] == "done").sum())
+    return f"{done} of {len(results.cells)} cells done, in {duration(results.seconds)} of one core in all"
+
+
+def _sections(results: Results) -> list[Section]:
+    """Everything that the report holds, from its files alone."""
+    study, cells = results.study, results.cells[results.cells["state"] == "done"]
+    seeds = f"{len(study['seeds'])} seeds" if len(study["seeds"]) > 1 else f"seed {study['seeds'][0]}"
+    opening = [str(study["question"])] if study["question"] else []
+    opening.append(
+        f"Normalised scores of the last checkpoint, mean ± standard deviation over {seeds}; {_progress(results)}."
+    )
+    if study["scale"] != 1:
+        opening.append(f"All budgets are multiplied by {study['scale']:g}: this is a trial, not a result.")
+    if study["budget"]:
+        stated = duration(60 * study["budget"] * study["scale"])
+        opening.append(f"Stated budget: {stated} of one core; spent: {duration(results.seconds)}.")
+    if study["paper"] in PAPERS:
+        opening.append(f"{PAPERS[study['paper']]} {DATA_DIFFER}")
+    if cells.empty:
+        return [Section("", [*opening, "No cell is done yet."]), *_making(results)]
+    sections = [Section("", opening), Section("Scores", [], results.table())]
+    if cells["best"].notna().any():
+        told = (
+            "The best checkpoint was chosen by playing in the test environment while it trained: an optimistic score."
+        )
+        sections.append(Section("The best checkpoint, apart", [told], results.table("best")))
+    if study["paper"] == "figure6" and cells["horizon"].notna().any():
+        sections.append(Section("Score over the horizon", [], None, figures.plot_horizon(cells), "horizon"))
+    if results.curves:
+        online: dict[str, list[pd.DataFrame]] = {}
+        for row in results.cells.to_dict("records"):
+            if row["key"] in results.curves:
+                online.setdefault(results.label(row.get("variant", row["method"])), []).append(
+                    results.curves[row["key"]]
+                )
+        sections.append(Section("While learning online", [], None, figures.plot_online(online), "online"))
+    return [*sections, *_statistics(results), *_making(results)]
+
+
+def _statistics(results: Results) -> list[Section]:
+    """What of the differences is real."""
+    comparison, groups, budgets = results.comparison(), results.groups(), results.budgets()
+    sections: list[Section] = []
+    if len(comparison) > 1:
+        told = (
+            "Interquartile mean (IQM) over seeds and tasks with its 95 % interval from a bootstrap stratified by task, "
+            "and the probability that a run of the setting beats one of the reference. With few seeds an interval is "
+            "no more than the range of what was seen: settings whose intervals overlap are not told apart here."
+        )
+        numbers = comparison.round(2)
+        sections.append(Section("Is it real?", [told], numbers, figures.plot_intervals(comparison), "intervals"))
+        sections.append(Section("Performance profiles", [], None, figures.plot_profiles(groups), "profiles"))
+    if budgets:
+        told = (
+            f"Score of the setting that one would deploy after at most {PULLS} evaluation episodes in all, spent by an "
+            "upper-confidence bandit on eight of the trained policies at a time."
+        )
+        sections.append(
+            Section("How many evaluations it takes", [told], None, figures.plot_budgets(budgets), "budgets")
+        )
+    return sections
+
+
+def _making(results: Results) -> list[Section]:
+    """By what all of it was made."""
+    made = [
+        ", ".join(f"{name} {version}" for name, version in one["versions"].items())
+        + (f"; commit {one['commit']}" if one.get("commit") else "")
+        + f"; {one['machine']}"
+        for one in results.made
+    ]
+    shown = results.cells[["title", "state", "score", "best", "chosen", "seconds"]].copy()
+    shown["seconds"] = shown["seconds"].map(duration)
+    shown = shown.rename(columns={"title": "cell", "seconds": "time, with all it reads"}).round(1)
+    shown = shown.dropna(axis=1, how="all")
+    commands = [(str(row["title"]), list(row["commands"])) for row in results.cells.to_dict("records")]
+    return [
+        Section("Every cell", [], shown),
+        Section("How it was made", [*made, f"The whole study: {results.command}"], commands=commands),
+    ]
+
+
+def _png(figure: Any) -> bytes:
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=130, metadata={"Software": None})
+    return file.getvalue()
+
+
+def _values(results: Results, sections: list[Section], pictures: dict[str, bytes]) -> dict[str, Any]:
+    """What the page's template uses."""
+    parts = []
+    for section in sections:
+        frame = section.table if section.table is not None else pd.DataFrame()
+        texts = frame.astype(object).where(frame.notna(), "-")
+        parts.append(
+            {
+                "title": section.title,
+                "lines": section.lines,
+                "columns": [str(name) for name in frame.columns],
+                "rows": [[str(value) for value in row] for row in texts.itertuples(index=False)],
+                "picture": base64.b64encode(pictures[section.name]).decode() if section.name in pictures else "",
+                "commands": section.commands,
+            }
+        )
+    return {"title": results.study["title"], "sections": parts}
+
+
+def _markdown(results: Results, sections: list[Section]) -> str:
+    parts = [f"# {results.study['title']}"]
+    for section in sections:
+        parts += [f"## {section.title}"] if section.title else []
+        parts += section.lines
+        parts += [markdown(section.table)] if section.table is not None else []
+        parts += [f"![{section.title}]({section.name}.png)"] if section.name else []
+        for name, commands in section.commands:
+            parts.append(f"{name}:\n\n```bash\n" + "\n".join(commands) + "\n```")
+    return "\n\n".join(parts) + "\n"

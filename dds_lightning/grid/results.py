@@ -1,0 +1,204 @@
+"""The results of a study as tables, read from the nodes that its cells are."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from dds_lightning.errors import UserError
+from dds_lightning.grid.file import BASE, PLAYERS
+from dds_lightning.grid.job import MADE, NODES
+from dds_lightning.saving.arrays import read_parquet
+from dds_lightning.saving.run_directory import Done, finished, read_marker
+from dds_lightning.saving.untrusted import TEXT, conform, mapping, parsing, read_csv, read_json
+from dds_lightning.study.paper import number_of
+from dds_lightning.study.protocol import BEST, LAST
+from dds_lightning.study.statistics import evaluation_curve, interval, mean_std, probability_of_improvement
+
+PULLS = 100
+"""Evaluation episodes that the curve of `evaluation_curve` goes up to."""
+
+
+@dataclass(frozen=True, eq=False)
+class Results:
+    """What a study has found so far.
+
+    Attributes:
+        place: The study's folder.
+        study: Its file, checked, as plain values.
+        command: What made it.
+        cells: A row for each cell: coordinates, `seed`, `state`, `score` (of the last checkpoint), `best` (of the best
+            checkpoint; NaN without one), `chosen` (how), `horizon`, `hold`, `seconds` (of the evaluation and all that
+            it reads), `key`, `commands`.
+        episodes: Key -> scores of the last checkpoint's episodes.
+        curves: Key -> what was reached while learning online: `env_steps` and `value`.
+        made: Distinct versions, commits and machines.
+        seconds: Of all nodes of the study, each counted once.
+    """
+
+    place: Path
+    study: Mapping[str, Any]
+    command: str
+    cells: pd.DataFrame
+    episodes: Mapping[str, NDArray[np.float64]]
+    curves: Mapping[str, pd.DataFrame]
+    made: list[dict[str, Any]]
+    seconds: float
+
+    @classmethod
+    def read(cls, place: Path) -> Results:
+        """Read a study's folder.
+
+        Raises:
+            UserError: No study is there, or a file is damaged.
+        """
+        file = place / "cells.json"
+        if not file.is_file():
+            raise UserError(f"{place} holds no study: there is no {file.name}; give OUT/NAME of `dds study run`")
+        with parsing(file, "run the study again"):
+            return cls._read(place, file)
+
+    @classmethod
+    def _read(cls, place: Path, file: Path) -> Results:
+        found = mapping(read_json(file, 64 * TEXT, root=place), file)
+        conform(found, {"study": (dict,), "cells": (list,), "command": (str,)}, str(file))
+        nodes, seen = place.parent / NODES, dict[str, Done | None]()
+        rows, episodes, curves, made = [], {}, {}, dict[str, dict[str, Any]]()
+        for cell in found["cells"]:
+            for key in cell["nodes"]:
+                if not re.fullmatch(r"[a-z0-9_]+-[0-9a-f]{16}", str(key)):
+                    raise UserError(f"{file}: {key!r} is no name of a job: run the study again")
+                if key not in seen:
+                    seen[key] = finished(nodes / key)
+                    if (nodes / key / MADE).is_file():
+                        one = mapping(read_json(nodes / key / MADE, root=nodes / key), key)
+                        made[json.dumps(one, sort_keys=True)] = one
+            rows.append(_row(cell, seen))
+            if (done := seen[cell["key"]]) is not None:
+                table = read_parquet(done.outputs["episodes"], {"actor": "O", "score": "f"}, "run the study again")
+                episodes[cell["key"]] = table.loc[table["actor"] == LAST, "score"].to_numpy(np.float64)
+            if (curve := _curve(cell, nodes)) is not None:
+                curves[cell["key"]] = curve
+        seconds = sum(done.seconds for done in seen.values() if done is not None)
+        study = dict(found["study"])
+        return cls(place, study, found["command"], pd.DataFrame(rows), episodes, curves, list(made.values()), seconds)
+
+    def label(self, name: Any) -> str:
+        """What the report calls an axis or a value."""
+        return str(self.study["labels"].get(str(name), PLAYERS[name].title if name in PLAYERS else name))
+
+    def name(self, where: Mapping[str, Any]) -> str:
+        """A place in the grid, in words: values that speak for themselves without their axis."""
+        parts = (
+            value if axis in ("variant", "method", "task") else f"{self.label(axis)} {self.label(value)}"
+            for axis, value in where.items()
+        )
+        return ", ".join(map(self.label, parts))
+
+    def layout(self) -> tuple[list[str], list[str]]:
+        """Coordinates of the table's rows and of its columns: those of the file, and what it does not name."""
+        rows, columns = list(self.study["rows"]), list(self.study["columns"])
+        several = [one for one in ("task", "method") if self.cells[one].nunique() > 1]
+        axes = [*several, *self.study["grid"], *(["variant"] if self.study["variants"] else [])]
+        open_axes = [axis for axis in axes if axis not in rows + columns]
+        if not rows and not columns and open_axes:
+            columns = [open_axes.pop()]
+        return rows + open_axes or ["task"], columns
+
+    def table(self, measure: str = "score") -> pd.DataFrame:
+        """The study's table: mean ± standard deviation over seeds, the paper's number in a column of its own."""
+        rows, columns = self.layout()
+        lines: dict[Any, dict[str, str]] = {}
+        done = self.cells[self.cells["state"] == "done"]
+        for chosen, part in done.groupby(rows + columns, sort=False, dropna=False):
+            where = dict(zip(rows + columns, chosen, strict=True))
+            line = lines.setdefault(tuple(where[name] for name in rows), {})
+            line |= {self.label(name): self.label(where[name]) for name in rows}
+            head = self.name({name: where[name] for name in columns}) or "score"
+            line[head] = mean_std(part[measure].dropna())
+            first = part.iloc[0]
+            settings = {**self.study["settings"], **where}
+            method = PLAYERS[first["method"]].title
+            if number := number_of(self.study["paper"], first["task"], method, settings):
+                mean, spread = number
+                line[f"{head} (paper)"] = f"{mean:.1f}" + ("" if spread is None else f" ± {spread:.1f}")
+        return pd.DataFrame(list(lines.values())).fillna("-")
+
+    def groups(self) -> dict[str, pd.DataFrame]:
+        """What is compared: name -> (seeds, tasks) scores of every setting that has all its cells."""
+        axes = [axis for axis in (*self.layout()[0], *self.layout()[1]) if axis != "task"]
+        found: dict[str, pd.DataFrame] = {}
+        for chosen, part in self.cells.groupby(axes, sort=False, dropna=False) if axes else [((), self.cells)]:
+            name = self.name(dict(zip(axes, chosen, strict=True)))
+            scores = part.pivot_table(index="seed", columns="task", values="score", sort=False)
+            if len(scores) and not scores.isna().any(axis=None):
+                found[name or "all"] = scores
+        return found
+
+    def comparison(self) -> pd.DataFrame:
+        """A row for each setting: interquartile mean with its interval, and how probably it beats the reference."""
+        groups, rows = self.groups(), []
+        reference = self.label(self.study["reference"] or BASE)
+        first = next((name for name in groups if name == reference), next(iter(groups), None))
+        for name, scores in groups.items():
+            middle = interval(scores)
+            row = {"setting": name, "runs": scores.size, "IQM": middle.value, "low": middle.low, "high": middle.high}
+            if name != first and first is not None and list(scores) == list(groups[first]):
+                better = probability_of_improvement(scores, groups[first])
+                row |= {"P(better)": better.value, "P low": better.low, "P high": better.high}
+            rows.append(row)
+        table = pd.DataFrame(rows)
+        return table.rename(columns={"P(better)": f"P(better than {first})"}) if first else table
+
+    def budgets(self) -> dict[str, NDArray[np.float64]]:
+        """Task and method -> score of the setting that so many evaluation episodes find, see `evaluation_curve`."""
+        found = {}
+        for (task, method), part in self.cells.groupby(["task", "method"], sort=False):
+            runs = [self.episodes[key] for key in part["key"] if key in self.episodes]
+            if len(runs) > 1:
+                count = min(map(len, runs))
+                found[f"{PLAYERS[method].title} on {task}"] = evaluation_curve([run[:count] for run in runs], PULLS)
+        return found
+
+
+def _row(cell: Mapping[str, Any], nodes: Mapping[str, Done | None]) -> dict[str, Any]:
+    """One row of `Results.cells`."""
+    row = {"task": cell["task"], "method": cell["method"], **cell["place"], "seed": cell["seed"], "key": cell["key"]}
+    row |= {"title": cell["title"], "state": "open", "score": np.nan, "best": np.nan, "chosen": ""}
+    row |= {"horizon": np.nan, "hold": np.nan}
+    done = nodes[cell["key"]]
+    if done is not None:
+        scores = {one["actor"]: one["score"] for one in done.facts["results"]}
+        row |= {"state": "done", "score": scores[LAST], "best": scores.get(BEST, np.nan)}
+    read = [one for key in cell["nodes"] if (one := nodes[key]) is not None]
+    row["seconds"] = sum(one.seconds for one in read)
+    row["commands"] = [str(one.facts["command"]) for one in read if "command" in one.facts]
+    for one in read:
+        if chosen := one.facts.get("chosen"):
+            row["chosen"] = f"{chosen['monitor']} at step {chosen['step']:,}"
+        if one.name.startswith("skill-"):
+            row["horizon"] = row["hold"] = read_marker(one.folder)["settings"]["data.horizon"]
+    row["hold"] = cell["settings"].get("evaluate.hold", row["hold"])
+    return row
+
+
+def _curve(cell: Mapping[str, Any], root: Path) -> pd.DataFrame | None:
+    """What an online training reached over environment steps; None for a cell without one."""
+    online = next((key for key in cell["nodes"] if key.startswith("online-")), None)
+    files = sorted((root / online).glob("logs/version_*/metrics.csv")) if online else []
+    if not files:
+        return None
+    table = pd.concat([read_csv(path, {"step": "iuf"}) for path in files])
+    value = next((name for name in ("online/success", "online/return") if name in table), None)
+    if value is None or "online/env_steps" not in table:
+        return None
+    table = table.drop_duplicates("step", keep="last").rename(columns={"online/env_steps": "env_steps", value: "value"})
+    return table[["env_steps", "value"]].dropna().sort_values("env_steps")

@@ -1,0 +1,147 @@
+"""`dds study run`: plan the cells of a study file, do what is not done yet, and write its report.
+
+```
+ OUT/nodes/KIND-HASH/    one piece of work each, shared by all studies in OUT
+ OUT/logs/KIND-HASH.txt  what it printed
+ OUT/NAME/cells.json     the cells of the study NAME, and the evaluation that each is
+ OUT/NAME/report/        tables, figures and one page
+```
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from dds_lightning.console.progress import on_terminal, progress_bar
+from dds_lightning.console.reports import Report
+from dds_lightning.console.terminal import Terminal
+from dds_lightning.envs.pool import available_cores
+from dds_lightning.errors import UserError
+from dds_lightning.grid.engines import ENGINES, Engine, Local, RayTasks, Slurm
+from dds_lightning.grid.file import Cell, Study, find_study, read_study
+from dds_lightning.grid.job import NODES
+from dds_lightning.grid.loop import Progress, run_nodes
+from dds_lightning.grid.nodes import Node, in_order, needed, plan
+from dds_lightning.saving.run_directory import duration, finished, locked, write_json
+
+CELLS = "cells.json"
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What `dds study run` was asked to do; see its help."""
+
+    file: str
+    out: Path = Path("runs/study")
+    engine: str = "local"
+    workers: int | None = None
+    scale: float = 1.0
+    cpus: float = 1
+    gpus: float = 0
+    minutes: int = 240
+    plan_only: bool = False
+
+
+def run_study(asked: Asked) -> Report:
+    """Do every cell that is not done yet, and report all of them.
+
+    Returns:
+        Its status is 1 where a cell failed: the others are done and in the report all the same.
+
+    Raises:
+        UserError: A study file or a setting that cannot work, found before anything runs.
+    """
+    path = find_study(asked.file)
+    study = read_study(path, asked.scale)
+    if asked.engine not in ENGINES:
+        raise UserError(f"--engine is {asked.engine}, expected one of {', '.join(ENGINES)}")
+    if asked.workers is not None and asked.workers < 1:
+        raise UserError(f"--workers is {asked.workers}, expected at least 1")
+    cells = plan(study)
+    nodes = in_order(node for _, node in cells.values())
+    place = asked.out / (path.stem if study.scale == 1 else f"{path.stem}@{study.scale:g}")
+    if asked.plan_only:
+        return _planned(asked, study, cells, nodes)
+    with locked(asked.out):
+        write_json(place / CELLS, _table(study, cells, asked))
+        failed = do_nodes(asked, nodes)
+    from dds_lightning.grid.report import report_study
+
+    report = report_study(place)
+    why = {cells[key][0].name(): reason for key, reason in failed.items() if key in cells}
+    told = [f"{nodes[key].title}: {reason}" for key, reason in failed.items() if not reason.startswith("not done")]
+    report.data["failed"] = why
+    if failed:
+        report.text += [f"{len(why)} of {len(cells)} cells failed; the same command tries them again:", *told]
+        report.text.append(f"what each of them printed is in {asked.out / 'logs'}")
+        report.status = 1
+    return report
+
+
+def do_nodes(asked: Asked, nodes: Mapping[str, Node]) -> dict[str, str]:
+    """Do those nodes that are not done and are needed.
+
+    Returns:
+        Key -> why it failed.
+    """
+    console = Terminal(stderr=True)
+    progress = Progress(0, 1)
+    done = set()
+    for key, node in nodes.items():
+        if (found := finished(asked.out / NODES / key)) is not None:
+            done.add(key)
+            progress.past[node.kind].append(found.seconds)
+    todo = needed(nodes, done)
+    progress.total = len(todo)
+    console.print(f"{len(nodes)} jobs, {len(done)} of them done before, {len(todo)} to do")
+    if not todo:
+        return {}
+    engine = _engine(asked)
+    progress.slots = engine.slots
+    shown = on_terminal()
+    try:
+        with progress_bar(
+            ("spinner", "bar", "count", "{task.description}"), len(todo), shown=shown, console=console
+        ) as bar:
+
+            def tell(line: str) -> None:
+                bar(completed=progress.done, description=line.rpartition("; ")[2] if "; " in line else "")
+                console.print(line, soft_wrap=True)
+
+            return run_nodes(todo, str(asked.out.absolute()), engine, progress, tell)
+    finally:
+        engine.close()
+
+
+def _engine(asked: Asked) -> Engine:
+    if asked.engine == "ray":
+        return RayTasks(asked.workers, asked.cpus, asked.gpus)
+    if asked.engine == "slurm":
+        return Slurm(asked.out / "slurm", asked.workers, int(asked.cpus), int(asked.gpus), asked.minutes)
+    return Local(asked.workers or available_cores())
+
+
+def _table(study: Study, cells: Mapping[str, tuple[Cell, Node]], asked: Asked) -> dict[str, Any]:
+    """What the report needs to know about the cells, as JSON values."""
+    rows = [
+        {"key": key, **asdict(cell), "nodes": list(in_order([node])), "title": cell.name()}
+        for key, (cell, node) in cells.items()
+    ]
+    scale = "" if study.scale == 1 else f" --scale={study.scale:g}"
+    command = f"dds study run {asked.file} --out={asked.out}{scale}"
+    return {"format": 1, "study": asdict(study), "cells": rows, "command": command}
+
+
+def _planned(asked: Asked, study: Study, cells: Mapping[str, tuple[Cell, Node]], nodes: Mapping[str, Node]) -> Report:
+    """What would be done."""
+    done = {key for key in nodes if finished(asked.out / NODES / key) is not None}
+    kinds: dict[str, int] = {}
+    for node in needed(nodes, done).values():
+        kinds[node.kind] = kinds.get(node.kind, 0) + 1
+    budget = f"; stated budget: {duration(60 * study.budget * study.scale)} of one core" if study.budget else ""
+    told = ", ".join(f"{count} {kind}" for kind, count in kinds.items()) or "nothing"
+    lines = [f"{study.title}: {len(cells)} cells{budget}", f"to do: {told}"]
+    return Report({"title": study.title, "cells": len(cells), "jobs": kinds, "done_before": len(done)}, lines)

@@ -1,0 +1,120 @@
+"""What the nodes of a study do. Each function takes (settings, how, what it reads, folder, resuming)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from dds_lightning.agent import DDSAgent
+from dds_lightning.errors import UserError
+from dds_lightning.grid.file import PLAYERS
+from dds_lightning.grid.nodes import arguments
+from dds_lightning.rollout.actors import Contestant
+from dds_lightning.rollout.play import rollout
+from dds_lightning.saving.run_directory import Done
+from dds_lightning.study.protocol import BEST, LAST, best_facts
+from dds_lightning.tasks import get_task
+from dds_lightning.training.stage_cli import command, command_line
+from dds_lightning.training.stages import STAGES
+
+Facts = Mapping[str, Any]
+Reads = Mapping[str, Done]
+
+
+def look_at_data(settings: Facts, how: Facts, reads: Reads, folder: Path, resuming: bool) -> Facts:
+    """Data that a user gave."""
+    return {"spec": settings["data"]}
+
+
+def collect_data(settings: Facts, how: Facts, reads: Reads, folder: Path, resuming: bool) -> Facts:
+    """Make the data in the environment."""
+    from datamodules.collect.collectors import collect
+
+    task = get_task(settings["task"])
+    steps, seed = int(settings["steps"]), int(settings["seed"])
+    made = collect(task, steps, seed, folder, 1, dataset_id=task.file_name, overwrite=True)
+    return {"data": made, "command": f"dds data collect {task.name} --steps={steps} --seed={seed}"}
+
+
+def relabel(settings: Facts, how: Facts, reads: Reads, folder: Path, resuming: bool) -> Facts:
+    """Fill the cache that policies over the same skills read."""
+    from datamodules.relabelled import RelabeledDataModule
+
+    options = {name: value for name, value in settings.items() if not name.startswith("task")}
+    skill = str(reads["skill"].outputs["checkpoint"])
+    module = RelabeledDataModule(settings["task"], _spec(reads), skill, cache=str(folder), **options)
+    module.prepare_data()
+    return {"cache": module.cache_file()}
+
+
+def train(settings: Facts, how: Facts, reads: Reads, folder: Path, resuming: bool) -> Facts:
+    """Run `dds STAGE fit`, from its last checkpoint if there is one."""
+    stage = settings["stage"]
+    words = arguments(stage, how, settings["seed"])
+    words += [f"--data.task={settings['task']}", f"--data.seed={settings['seed']}"]
+    # Online, data would be prior data.
+    words += [f"--data.data={_spec(reads)}"] if stage != "online" else []
+    words += [f"--{flag}={reads[read].outputs['checkpoint']}" for read, flag in STAGES[stage].reads.items()]
+    words += [f"--data.cache={reads['relabel'].outputs['cache'].parent}"] if "relabel" in reads else []
+    words += _watching(settings["watch"], settings["seed"]) if "watch" in settings else []
+    words += [f"--trainer.default_root_dir={folder}", f"--checkpoint.dirpath={folder}", "--trainer.devices=1"]
+    words += ["--trainer.enable_model_summary=false", "--trainer.enable_progress_bar=false"]
+    last = folder / "last.ckpt"
+    resume = [f"--ckpt_path={last}"] if resuming and last.is_file() else []
+    fitted = command(stage, [*words, *resume])().data
+    made: dict[str, Any] = {name: Path(fitted[name]) for name in ("checkpoint", "best") if fitted[name]}
+    if "best" in made:
+        made["chosen"] = best_facts(made["checkpoint"], made["best"])
+        if "watch" not in settings:  # the preset itself keeps the best, by a loss
+            made["checkpoint"] = made.pop("best")
+    metrics = {name: round(value, 6) for name, value in fitted["metrics"].items()}
+    return {**made, "steps": fitted["steps"], "metrics": metrics, "command": command_line(stage, words)}
+
+
+def evaluate(settings: Facts, how: Facts, reads: Reads, folder: Path, resuming: bool) -> Facts:
+    """Play the last checkpoint and, where one was kept, the best, in the real environment."""
+    method, task = PLAYERS[settings["method"]], get_task(settings["task"])
+    last = {stage: str(reads[stage].outputs["checkpoint"]) for stage in method.stages}
+    ends = {LAST: last}
+    final = reads[method.stages[-1]]
+    if "best" in final.outputs:
+        ends[BEST] = {**last, method.stages[-1]: str(final.outputs["best"])}
+    names = ("selection", "temperature", "noise_scale", "hold")
+    acting = {name: settings[name] for name in names if name in settings}
+    players = []
+    for name, checkpoints in ends.items():
+        actor = method.play(checkpoints)
+        if isinstance(actor, DDSAgent):
+            actor = actor.variant(**acting, seed=settings["seed"])
+        elif how["asked"]:
+            raise UserError(
+                f"evaluate.{how['asked'][0]} is for agents over skills, which {method.title} has not: leave it out"
+            )
+        players.append(Contestant(name, actor, settings["episodes"]))
+    result = rollout(task, players, seed=settings["seed"], workers=0)
+    result.save(folder)
+    rows = json.loads(result.summary().round(4).to_json(orient="records"))
+    flags = [f"--skill={last['skill']}"] if "skill" in last else []
+    flags.append(f"--policy={last[method.stages[-1]]}")
+    flags += [f"--{name}={value}" for name, value in acting.items()]
+    told = " ".join(["dds evaluate", *flags, f"--task={task.name}", f"--episodes={settings['episodes']}"])
+    told += f" --seed={settings['seed']}"
+    return {"episodes": folder / "episodes.parquet", "results": rows, "command": told}
+
+
+def _spec(reads: Reads) -> str:
+    data = reads["data"]
+    return data.facts["spec"] if "spec" in data.facts else f"local:{data.outputs['data']}"
+
+
+def _watching(watch: Facts, seed: int) -> list[str]:
+    """The arguments that evaluate a training now and then and keep its best checkpoint."""
+    acting = {name: watch[name] for name in ("temperature", "noise_scale") if name in watch}
+    # Other starts than those of the table: the best is not scored by the episodes that chose it.
+    chosen = {"episodes": watch["episodes"], "every_n_steps": watch["every"], "seed": seed + 1, "workers": 0, **acting}
+    chosen["selections"] = [watch.get("selection", "greedy")]
+    callback = {"class_path": "dds_lightning.callbacks.RolloutEvaluation", "init_args": chosen}
+    best = ["--best.monitor=rollout/score", f"--best.every_n_steps={watch['every']}"]
+    return [f"--trainer.callbacks+={json.dumps(callback)}", *best]

@@ -1,0 +1,109 @@
+"""Study files: what they span, and how a wrong one is answered."""
+
+import pytest
+import yaml
+
+from dds_lightning.errors import UserError
+from dds_lightning.grid.file import packaged_studies, read_study
+from dds_lightning.grid.nodes import in_order, plan
+
+TASK = "pointmaze-umaze-diverse"
+TINY = {"title": "Tiny", "tasks": [TASK]}
+
+
+def study(tmp_path, scale=1.0, **keys):
+    path = tmp_path / "study.yaml"
+    path.write_text(yaml.safe_dump({**TINY, **keys}, sort_keys=False))
+    return read_study(path, scale)
+
+
+def nodes(found):
+    cells = plan(found)
+    return in_order(node for _, node in cells.values())
+
+
+def kinds(found):
+    made = [node.kind for node in nodes(found).values()]
+    return {kind: made.count(kind) for kind in dict.fromkeys(made)}
+
+
+def test_a_grid_is_every_combination_and_shares_what_can_be_shared(tmp_path):
+    found = study(tmp_path, seeds=[0, 1], grid={"skill.model.num_skills": [4, 8], "policy.model.alpha": [1.0, 3.5]})
+    assert len(list(found.cells())) == 8
+    # One skill model and one relabelling serve both policies; one data set serves all.
+    assert kinds(found) == {"data": 1, "skill": 4, "relabel": 4, "policy": 8, "evaluate": 8}
+
+
+def test_ways_of_acting_share_all_trainings(tmp_path):
+    found = study(tmp_path, variants={"noiseless": {"evaluate.noise_scale": 0}, "held": {"evaluate.hold": 5}})
+    assert kinds(found) == {"data": 1, "skill": 1, "relabel": 1, "policy": 1, "evaluate": 3}
+
+
+def test_a_setting_that_is_given_as_the_preset_has_it_changes_no_key(tmp_path):
+    plain, given = study(tmp_path), study(tmp_path, settings={"skill.model.skill_dim": 64, "policy.model.lr": "1e-3"})
+    assert list(plan(plain)) == list(plan(given))
+    assert list(plan(plain)) != list(plan(study(tmp_path, settings={"skill.model.skill_dim": 32})))
+
+
+def test_scale_divides_every_budget(tmp_path):
+    full, small = (
+        {node.kind: node.settings for node in nodes(study(tmp_path, scale)).values()} for scale in (1.0, 0.01)
+    )
+    assert (full["data"]["steps"], small["data"]["steps"]) == (200_000, 2_000)
+    assert (full["skill"]["trainer.max_steps"], small["skill"]["trainer.max_steps"]) == (2500, 25)
+    assert (full["policy"]["trainer.max_steps"], small["policy"]["trainer.max_steps"]) == (12_000, 120)
+    assert (full["evaluate"]["episodes"], small["evaluate"]["episodes"]) == (100, 2)
+
+
+@pytest.mark.parametrize("name", packaged_studies())
+def test_packaged_studies_can_be_planned(name):
+    from dds_lightning.grid.file import find_study
+
+    found = read_study(find_study(name))
+    assert found.budget
+    assert found.seeds == (0, 1, 2)
+    assert len(plan(found)) == len(list(found.cells()))
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"methods": ["ddss"]}, r"methods: there is no method ddss: did you mean dds\?"),
+        ({"tasks": ["pointmaze-umase-diverse"]}, "pointmaze-umase-diverse"),
+        ({"tasks": []}, "tasks is missing or empty"),
+        ({"grid": {"skill.model.num_skills": []}}, r"skill.model.num_skills is \[\], expected a list of one or more"),
+        ({"grid": {"skill.model.num_skills": [4, 8, 4]}}, "skill.model.num_skills holds 4 twice"),
+        ({"seeds": [0, 0]}, "seeds holds 0 twice"),
+        ({"seeds": [-1]}, "seeds is -1, expected a whole number from 0"),
+        ({"seeds": [0.5]}, "seeds holds 0.5, expected whole numbers"),
+        (
+            {"grid": {"skill.model.num_skils": [4]}},
+            r"--skill.model.num_skils is not an option of `dds skill fit`: did you mean --skill.model.num_skills or",
+        ),
+        ({"settings": {"skill.model.num_skills": "many"}}, "num_skills is many, expected a whole number"),
+        ({"settings": {"skil.model.num_skills": 4}}, r"is no setting: did you mean skill.model.num_skills"),
+        ({"settings": {"clone.model.lr": 0.1}}, "clone.model.lr is a setting of clone, which no method of this study"),
+        ({"settings": {"policy.data.skill": "x.ckpt"}}, "policy.data.skill is set by the study itself"),
+        ({"settings": {"evaluate.noise": 0.5}}, r"evaluate.noise is no setting .*did you mean evaluate.noise_scale or"),
+        ({"settings": {"evaluate.selection": "best"}}, "evaluate.selection is 'best', expected greedy, sample"),
+        ({"variants": {"same": {"skill.model.skill_dim": 64}}}, "two cells are the same, .* and '.*same"),
+        ({"variants": {"base": {"skill.model.skill_dim": 32}}}, "base is there without being named"),
+        ({"gird": {}}, r"gird is no setting of a study: did you mean grid\?"),
+        ({"seeds": 3}, "seeds is 3, expected a list"),
+        ({"columns": ["skill.model.num_skills"]}, "columns names skill.model.num_skills, which the study has not"),
+        ({"watch": -1}, "watch is -1, expected 0"),
+    ],
+)
+def test_a_wrong_study_is_answered_in_one_sentence(tmp_path, keys, message):
+    with pytest.raises(UserError, match=message) as told:
+        plan(study(tmp_path, **keys))
+    assert "\n" not in str(told.value)
+
+
+def test_wrong_scales_and_files_are_refused(tmp_path, dds):
+    with pytest.raises(UserError, match=r"--scale is 0\.0, expected more than 0"):
+        study(tmp_path, 0.0)
+    answer = dds("study", "run", "tabel2")
+    assert answer.status == 2
+    assert "there is no file tabel2: did you mean table2 or table3?" in answer.err
+    assert dds("study", "report", tmp_path).err.count("holds no study") == 1

@@ -1,0 +1,158 @@
+"""The report of a study, from results made up by hand: its tables, its intervals, its page."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from rich.console import Console
+
+from dds_lightning.errors import UserError
+from dds_lightning.grid.file import read_study
+from dds_lightning.grid.job import MADE, NODES
+from dds_lightning.grid.nodes import in_order, plan
+from dds_lightning.grid.report import report_study
+from dds_lightning.grid.results import Results
+from dds_lightning.grid.run import CELLS, Asked, _table
+from dds_lightning.rollout.result import RolloutResult
+from dds_lightning.saving.run_directory import RunDirectory, write_json
+
+TASK = "pointmaze-large-diverse"
+SCORES = {(32, 4): (10, 20, 30), (32, 8): (40, 50, 60), (64, 4): (50, 50, 50), (64, 8): (90, 95, 100)}
+"""(D, K) -> score of each seed."""
+
+
+def evaluation(scores):
+    """Work that leaves the table of a rollout: (checkpoint, score) in two episodes each."""
+
+    def work(folder, resuming):
+        rows = [
+            {"actor": actor, "label": actor, "episode": episode, "seed": 0, "return": 1.0, "score": float(score)}
+            | {"success": True, "terminated": True, "length": 5, "final_x": 0.0, "final_y": 0.0}
+            | {"final_code": 0, "codes": [0]}
+            for actor, score in scores.items()
+            for episode in range(2)
+        ]
+        result = RolloutResult(TASK, pd.DataFrame(rows))
+        result.save(folder)
+        facts = [{"actor": actor, "score": float(score), "success": 0.0} for actor, score in scores.items()]
+        return {"episodes": folder / "episodes.parquet", "results": facts, "command": "dds evaluate --skill=s.ckpt"}
+
+    return work
+
+
+def training(folder, resuming):
+    (folder / "last.ckpt").write_text("weights")
+    chosen = {"monitor": "rollout/score", "step": 600, "value": 1.0, "evaluations": 4}
+    return {"checkpoint": folder / "last.ckpt", "chosen": chosen, "command": f"dds fit {folder.name}"}
+
+
+def made(tmp_path, best=False, left_out=(), **keys):
+    """A study's folder with results, the cells at `left_out` missing."""
+    tmp_path.mkdir(exist_ok=True)
+    path = tmp_path / "mine.yaml"
+    grid = {"skill.model.skill_dim": [32, 64], "skill.model.num_skills": [4, 8]}
+    labels = {"skill.model.num_skills": "K", "skill.model.skill_dim": "D"}
+    layout = {"rows": ["skill.model.skill_dim"], "columns": ["skill.model.num_skills"], "labels": labels}
+    head = {"title": "K and D", "question": "Does K matter?", "tasks": [TASK], "seeds": [0, 1, 2], "budget": 60}
+    path.write_text(yaml.safe_dump({**head, "grid": grid, **layout, **keys}, sort_keys=False))
+    study = read_study(path)
+    cells = plan(study)
+    root = tmp_path / NODES
+    directory = RunDirectory(root, Console(quiet=True))
+    for index, (cell, node) in enumerate(cells.values()):
+        score = SCORES[tuple(cell.place.values())][cell.seed]
+        work = evaluation({"last": score, **({"best": score + 1} if best else {})})
+        for one in in_order([node]).values():
+            if one.kind == "evaluate" and index in left_out:
+                continue
+            directory.do(one.key, one.title, one.settings, [], work if one.kind == "evaluate" else training)
+            write_json(
+                root / one.key / MADE, {"versions": {"torch": "2.13"}, "commit": "abc123", "machine": "x, 2 cores"}
+            )
+    place = tmp_path / "mine"
+    write_json(place / CELLS, _table(study, cells, Asked(str(path), tmp_path)))
+    return place
+
+
+def test_a_grid_of_two_axes_is_laid_out_as_table_2_with_the_papers_numbers_beside(tmp_path):
+    results = Results.read(made(tmp_path, paper="table2"))
+    table = results.table()
+    assert list(table.columns) == ["D", "K 4", "K 4 (paper)", "K 8", "K 8 (paper)"]
+    assert table.to_numpy().tolist() == [
+        ["32", "20.0 ± 10.0", "85.2 ± 0.2", "50.0 ± 10.0", "85.1 ± 1.5"],
+        ["64", "50.0 ± 0.0", "79.3 ± 0.5", "95.0 ± 5.0", "88.9 ± 0.3"],
+    ]
+
+
+def test_settings_are_compared_by_intervals_with_the_first(tmp_path):
+    table = Results.read(made(tmp_path)).comparison()
+    assert list(table["setting"]) == ["D 32, K 4", "D 32, K 8", "D 64, K 4", "D 64, K 8"]
+    assert table["IQM"].tolist() == [20, 50, 50, 95]
+    assert table.loc[2, ["low", "high"]].tolist() == [50, 50]
+    assert (table["low"] <= table["IQM"]).all()
+    better = table["P(better than D 32, K 4)"].tolist()
+    assert np.isnan(better[0])
+    assert better[1:] == [1, 1, 1]
+
+
+def test_the_page_says_how_every_number_was_made(tmp_path):
+    place = made(tmp_path, best=True, paper="table2", watch=4)
+    report = report_study(place)
+    text, page = (place / "report" / "report.md").read_text(), (place / "report" / "index.html").read_text()
+    for told in (
+        "Does K matter?",
+        "12 of 12 cells done",
+        "Stated budget: 1 h 0 min of one core",
+        "The paper's numbers are for other data",
+        "| 32 | 20.0 ± 10.0 | 85.2 ± 0.2 |",
+        "The best checkpoint, apart",
+        "21.0 ± 10.0",
+        "rollout/score at step 600",
+        "torch 2.13; commit abc123; x, 2 cores",
+        "dds evaluate --skill=s.ckpt",
+        "dds fit skill-",
+        f"dds study run {tmp_path / 'mine.yaml'}",
+    ):
+        assert told in text, told
+    assert "Is it real?" in page
+    assert page.count("data:image/png;base64,") == text.count("![") == 3
+    assert "<script" not in page
+    assert 'src="http' not in page
+    assert Path(report.data["report"]) == place / "report" / "index.html"
+    assert len(pd.read_csv(place / "report" / "cells.csv")) == 12
+
+
+def test_a_study_that_is_not_finished_has_a_report_of_what_there_is(tmp_path):
+    place = made(tmp_path, left_out=range(1, 12))
+    report_study(place)
+    text = (place / "report" / "report.md").read_text()
+    assert "1 of 12 cells done" in text
+    results = Results.read(place)
+    assert results.table().to_numpy().tolist() == [["32", "10.0"]]
+    empty = made(tmp_path / "empty", left_out=range(12))
+    report_study(empty)
+    assert "No cell is done yet." in (empty / "report" / "report.md").read_text()
+
+
+@pytest.mark.parametrize(("horizon", "hold"), [(10, None), (20, 5)])
+def test_figure_6_knows_the_horizon_and_how_long_a_skill_is_held(tmp_path, horizon, hold):
+    settings = {"skill.data.horizon": horizon, **({} if hold is None else {"evaluate.hold": hold})}
+    place = made(tmp_path, paper="figure6", settings=settings)
+    cells = Results.read(place).cells
+    assert set(cells["horizon"]) == {horizon}
+    assert set(cells["hold"]) == {hold or horizon}
+    report_study(place)
+    assert (place / "report" / "horizon.png").stat().st_size > 5_000
+
+
+@pytest.mark.parametrize(
+    "change", [lambda text: text.replace("evaluate-", "../../x"), lambda text: text[:200], lambda _: "[]"]
+)
+def test_a_damaged_study_is_told_in_a_sentence(tmp_path, change):
+    place = made(tmp_path, left_out=range(12))
+    file = place / CELLS
+    file.write_text(change(file.read_text()))
+    with pytest.raises(UserError, match=r"cells\.json"):
+        report_study(place)
