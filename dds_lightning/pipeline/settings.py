@@ -44,6 +44,7 @@ class RunSettings:
     workers: int | None = None
     until: str = "report"
     fresh: bool = False
+    jobs: int | None = None
     stages: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Training stage -> arguments for its `fit`, as a user gave them."""
 
