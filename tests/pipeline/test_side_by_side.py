@@ -20,8 +20,6 @@ from dds_lightning.pipeline.seeds import Turns, over_seeds
 from dds_lightning.pipeline.steps import STEPS, every_step
 from tests.pipeline.test_run import SMALL, TASK
 
-SMALL = [word for word in SMALL if "workers" not in word] + ["--workers=0"]
-
 
 def call(capsys, *words):
     capsys.readouterr()
