@@ -166,7 +166,9 @@ def contenders() -> Iterator[Contender]:
         model, data = settings(f"paper/{stage}.yaml")
         module = skill_model(**model) if stage == "skill" else PolicyModule(OBSERVATIONS, SKILLS, **model)
         batch = segments(data["batch_size"], data["horizon"]) if stage == "skill" else transitions(data["batch_size"])
-        yield Contender(stage, "the paper's configuration, plain loop", "32-true", alone(module, batch, fused=False))
+        part = "" if stage == "skill" else " of its first phase, the critic alone"
+        name = f"the paper's configuration, plain loop{part}"
+        yield Contender(stage, name, "32-true", alone(module, batch, fused=False))
 
 
 def _repeat(update: Callable[[], Any]) -> Callable[[int], None]:
@@ -214,6 +216,34 @@ def measure(rounds: int, budget: float) -> pd.DataFrame:
     return table
 
 
+TITLES = {
+    "bench": "Steps per second",
+    "costs": "What a step costs\n\n![costs](costs.png)",
+    "runs": "Seconds to a score\n\nWhat the run directories recorded, stage by stage.",
+    "busy": "Beside a busy program",
+}
+
+
+def write(tables: dict[str, pd.DataFrame], out: Path) -> str:
+    """Write the tables, the figure and the page, which is returned."""
+    parts.draw_costs(tables["costs"], out / "costs.png")
+    speeds = tables["bench"].groupby("precision")["product"].first() / 1e9
+    about = f"torch {torch.__version__}, {platform.machine()}, one thread; matrix product: "
+    about += ", ".join(f"{speed:.0f} GFLOP/s in {name}" for name, speed in speeds.items())
+    page = [f"# Speed\n\nWritten by `make bench`, whose docstring explains the columns. {about}."]
+    for name, table in tables.items():
+        with written_whole(out / f"{name}.parquet") as part:
+            table.to_parquet(part, index=False)
+        formats = {key: ".2f" for key in table.columns if table[key].dtype.kind == "f"}
+        shown = table.drop(columns=["flops", "ours", "product"], errors="ignore")
+        formats |= {"steps_per_s": ".1f", "ms": ".1f", "value": ",.0f"}
+        page += [f"## {TITLES[name]}", markdown(shown, formats)]
+    text = "\n\n".join(page) + "\n"
+    with written_whole(out / "bench.md") as part:
+        part.write_text(text, encoding="utf-8")
+    return text
+
+
 def main() -> None:
     """Measure, print and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -233,20 +263,7 @@ def main() -> None:
     if asked.busy:
         skill, batch = ours()["skill"]
         tables["busy"] = parts.beside_busy(skill, batch)
-    parts.draw_costs(tables["costs"], asked.out / "costs.png")
-    speeds = tables["bench"].groupby("precision")["product"].first() / 1e9
-    about = f"torch {torch.__version__}, {platform.processor() or platform.machine()}, one thread; matrix product: "
-    about += ", ".join(f"{speed:.0f} GFLOP/s in {name}" for name, speed in speeds.items())
-    page = [f"# Speed\n\nWritten by `make bench`. {about}."]
-    for name, table in tables.items():
-        with written_whole(asked.out / f"{name}.parquet") as part:
-            table.to_parquet(part, index=False)
-        formats = {key: ".2f" for key in table.columns if table[key].dtype.kind == "f"}
-        shown = table.drop(columns=["flops", "ours", "product"], errors="ignore")
-        page += [f"## {name}", markdown(shown, {**formats, "steps_per_s": ".1f", "ms": ".1f", "value": ",.0f"})]
-    with written_whole(asked.out / "bench.md") as part:
-        part.write_text("\n\n".join([*page, "![costs](costs.png)"]) + "\n", encoding="utf-8")
-    print("\n\n".join(page))
+    print(write(tables, asked.out))
 
 
 if __name__ == "__main__":

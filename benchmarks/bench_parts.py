@@ -135,7 +135,15 @@ def draw_costs(table: pd.DataFrame, path: Path) -> None:
     for axis, name in zip(axes, names, strict=True):
         chosen = table[table["size"] == name]
         axis.plot(chosen["value"], chosen["ms"], "o-")
-        axis.set(xscale="log", ylim=(0, None), xlabel=name, title=chosen["stage"].iloc[0], ylabel="ms a step")
+        axis.set(
+            xscale="log",
+            ylim=(0, 1.1 * chosen["ms"].max()),
+            xlabel=name,
+            title=chosen["stage"].iloc[0],
+            ylabel="ms a step",
+        )
+        axis.set_xticks(chosen["value"], [f"{value:,}" for value in chosen["value"]], minor=False)
+        axis.minorticks_off()
     with written_whole(path) as part:
         figure.savefig(part, format="png", dpi=120)
     plt.close(figure)

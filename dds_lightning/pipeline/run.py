@@ -47,9 +47,13 @@ def _do_steps(run: Run) -> None:
     steps = [STEPS[name] for name in names[: names.index(run.wanted.until) + 1]]
     parts = [part for step in steps for part in (step.ahead, step) if part is not None and part.beside]
 
+    # Here and not when they begin: parsers and filters of warnings are not made for two threads.
+    known = {part.name: (part.settings(run), part.former(run) if part.former else None) for part in parts}
+
     def do(step: Step, work: Work, directory: RunDirectory = told) -> Done:
-        reads, former = [run.done[name] for name in step.reads], step.former(run) if step.former else None
-        return directory.do(step.name, step.title(run), step.settings(run), reads, work, former)
+        settings, former = known.get(step.name) or (step.settings(run), step.former(run) if step.former else None)
+        reads = [run.done[name] for name in step.reads]
+        return directory.do(step.name, step.title(run), settings, reads, work, former)
 
     def front(step: Step) -> Done:
         def work(folder: Path, resuming: bool) -> Mapping[str, Any]:
