@@ -139,7 +139,7 @@ def test_side_by_side_gives_the_same_bits_and_the_same_table(capsys, tmp_path, d
 
 
 @pytest.mark.slow
-def test_a_stopped_run_stops_all_its_trainings_and_goes_on_with_the_same_bits(capsys, tmp_path, data):
+def test_a_stopped_run_stops_all_its_trainings_where_they_can_go_on(capsys, tmp_path, data):
     words = ["--out", tmp_path / "run", *SMALL, data, "--jobs=2", "--until=clone", "--clone_steps=20000"]
     words += ["--policy.trainer.max_steps=20000", "--clone.checkpoint.every_n_steps=1"]
     kept = [tmp_path / "run" / stage / "last.ckpt" for stage in ("policy", "clone")]
