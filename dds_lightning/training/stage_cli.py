@@ -7,7 +7,6 @@
 - A mistake in the data is found before the first file is written.
 """
 
-import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -347,8 +346,3 @@ def parsed(stage: str, arguments: Sequence[str]) -> StageCLI:
         UserError: Arguments that `dds STAGE fit` does not understand.
     """
     return StageCLI(stage, arguments, parse_only=True)
-
-
-def command_line(stage: str, arguments: Sequence[str]) -> str:
-    """The command a person would type for these arguments."""
-    return shlex.join(["dds", stage, *arguments])
