@@ -10,7 +10,7 @@ CONSTRAINTS ?= constraints.txt
 PYTEST_ARGS ?= -n auto --dist loadscope -m 'not faults'
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-oldest test-python pin-oldest faults lint format audit figures notebooks notebooks-env clean
+.PHONY: help bench demo test test-oldest test-python pin-oldest faults lint format audit figures notebooks notebooks-env clean
 
 help:  ## show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## */\1|/' | awk -F'|' '{printf "  make %-14s %s\n", $$1, $$2}'
@@ -59,6 +59,10 @@ lint: $(VENV)/.installed  ## ruff and mypy, without changing files
 format: $(VENV)/.installed  ## let ruff fix what it can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+# Other packages are measured where they are installed: pip install -e '.[peers]' -c constraints.txt
+bench: $(VENV)/.installed  ## how fast each training is, beside the processor's limit and other packages
+	$(BIN)/python benchmarks/bench.py
 
 # Not in an extra: training and testing do not need an auditor.
 audit: $(VENV)/.installed  ## look every pinned version up among known vulnerabilities (needs a network)

@@ -204,6 +204,13 @@ class StageModule(pl.LightningModule):
         part.load_state_dict(state)
         return more
 
+    def term_of_all(self, name: str) -> Tensor:
+        """A term of the last training step; in a distributed training its mean over the processes."""
+        if getattr(self.trainer, "world_size", 1) == 1:
+            return self.terms[name]
+        mean: Tensor = self.trainer.strategy.reduce(self.terms[name].clone(), reduce_op="mean")
+        return mean
+
     def log_training(self, total: Tensor, more: Callable[[], Mapping[str, Tensor]] = dict) -> None:
         """Log a training step's loss and terms, at the steps of `is_log_step`.
 

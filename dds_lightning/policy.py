@@ -323,7 +323,7 @@ class PolicyModule(StageModule):
         """One optimiser step's loss."""
         total, self.terms = self.loss(batch)
         if self.hparams.alpha_unit == "spread":  # at first the mean of all batches, then of the last few hundred
-            self.advantage_spread.lerp_(self.terms["advantage_std"], max(0.005, 1.0 / (1 + self.global_step)))
+            self.advantage_spread.lerp_(self.term_of_all("advantage_std"), max(0.005, 1.0 / (1 + self.global_step)))
         self.log_training(total)
         if self.global_step % self.hparams.watch == 0:
             for message in complaints(self.terms, self.value_range, self.hparams.weight_clip):

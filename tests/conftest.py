@@ -24,8 +24,9 @@ def _connect_here_only(self, address):
 
 @pytest.fixture(scope="session", autouse=True)
 def _isolated_process(tmp_path_factory):
-    """Keep the suite off the network, out of ~/.minari, and on one thread."""
+    """Keep the suite off the network, out of ~/.minari, and on one thread of one core."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "sched_getaffinity", lambda pid: {0}, raising=False)
         patch.setattr(socket.socket, "connect", _connect_here_only)
         patch.setenv("MINARI_DATASETS_PATH", str(tmp_path_factory.mktemp("minari")))
         patch.setenv("HOME", str(tmp_path_factory.mktemp("home")))

@@ -79,7 +79,7 @@ ROOMS = {
     "policy rollout saving skill tasks datamodules.collect datamodules.relabel datamodules.relabelling "
     "datamodules.sources",
     "dds_lightning.sharing": "agent errors saving tasks training",
-    "dds_lightning.pipeline": "agent baselines configs console errors interpret.draw online policy rollout saving "
+    "dds_lightning.pipeline": "agent baselines configs console envs errors interpret.draw online policy rollout saving "
     "skill study tasks training datamodules.collect datamodules.inspection datamodules.relabelled "
     "datamodules.relabelling datamodules.relabel datamodules.sources",
     "dds_lightning.grid": "agent baselines configs console envs errors online rollout saving study tasks training "

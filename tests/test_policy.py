@@ -65,7 +65,7 @@ class Chain(pl.LightningDataModule):
         return DataLoader([self.data] * 100, batch_size=None)
 
 
-def fit(module: PolicyModule, steps: int, datamodule: pl.LightningDataModule) -> pl.Trainer:
+def fit(module: PolicyModule, steps: int, datamodule: pl.LightningDataModule, **settings) -> pl.Trainer:
     trainer = pl.Trainer(
         max_steps=steps,
         logger=False,
@@ -74,6 +74,7 @@ def fit(module: PolicyModule, steps: int, datamodule: pl.LightningDataModule) ->
         enable_progress_bar=False,
         enable_model_summary=False,
         log_every_n_steps=50,
+        **settings,
     )
     trainer.fit(module, datamodule)
     return trainer
@@ -387,3 +388,12 @@ def test_fourier_features_may_see_the_position_alone():
     assert torch.equal(module.embed(here)[:, width:], module.embed(elsewhere)[:, width:])
     assert not torch.equal(module.embed(here), module.embed(elsewhere))
     assert module.features.output_dim == width + 16
+
+
+def test_a_policy_trains_in_bfloat16_whatever_the_unit_of_alpha():
+    """Its story: the running spread of advantages refused a number of another precision in the first step."""
+    module = small(observation_dim=5, alpha_unit="spread", awr="closed_form", fourier_features=4)
+    fit(module, 3, Chain(), precision="bf16-mixed")
+    assert float(module.advantage_spread) != 1.0
+    assert {value.dtype for value in module.terms.values()} == {torch.float32}
+    assert all(bool(torch.isfinite(value).all()) for value in module.terms.values())

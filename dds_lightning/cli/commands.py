@@ -32,6 +32,8 @@ def run(
     workers: int | None = None,
     until: Literal["data", "skill", "relabel", "policy", "clone", "examine", "evaluate", "report", "online"] = "report",
     fresh: bool = False,
+    jobs: int | None = None,
+    seeds: int | None = None,
     **stages: list[str],
 ) -> Report:
     """Do everything for one task: data, skills, relabelling, policy, baseline, evaluation, report.
@@ -72,33 +74,38 @@ def run(
         workers: Number of processes for the environments; without it one per core.
         until: The last stage to do; online, after the report, goes on in the environment itself.
         fresh: Do every stage again.
+        jobs: How many stages (with --seeds, runs) are done at the same time; 1: one after the other; without it one
+            per core. The clone trains, and those who need no policy play, while the policy trains.
+        seeds: Do the whole run with this many seeds, `seed` and those that follow, one thread each, in folders
+            seed-N of `out`; the table has mean, standard deviation and interquartile mean over the seeds.
         **stages: Settings for `dds STAGE fit` of each training stage, see above.
     """
     from dds_lightning.pipeline.run import run_all
+    from dds_lightning.pipeline.seeds import run_seeds
     from dds_lightning.pipeline.settings import RunSettings
     from dds_lightning.tasks import get_task
 
-    return run_all(
-        RunSettings.with_preset(
-            task=task,
-            out=Path(out or f"runs/{get_task(task).file_name}"),
-            data=data_spec(data) if data else None,
-            seed=seed,
-            preset=preset,
-            data_steps=data_steps,
-            clone_steps=clone_steps,
-            evaluate_every=evaluate_every,
-            episodes=episodes,
-            episodes_per_skill=episodes_per_skill,
-            selection=selection,
-            temperature=temperature,
-            noise_scale=noise_scale,
-            workers=workers,
-            until=until,
-            fresh=fresh,
-            stages={name: tuple(arguments) for name, arguments in stages.items()},
-        )
+    settings = RunSettings.with_preset(
+        task=task,
+        out=Path(out or f"runs/{get_task(task).file_name}"),
+        data=data_spec(data) if data else None,
+        seed=seed,
+        preset=preset,
+        data_steps=data_steps,
+        clone_steps=clone_steps,
+        evaluate_every=evaluate_every,
+        episodes=episodes,
+        episodes_per_skill=episodes_per_skill,
+        selection=selection,
+        temperature=temperature,
+        noise_scale=noise_scale,
+        workers=workers,
+        until=until,
+        fresh=fresh,
+        jobs=jobs,
+        stages={name: tuple(arguments) for name, arguments in stages.items()},
     )
+    return run_all(settings) if seeds is None else run_seeds(settings, seeds)
 
 
 def relabel(

@@ -49,8 +49,10 @@ EVALUATE: dict[str, Any] = {
     "hold": None,
 }
 """Settings of the evaluation, `evaluate.KEY`."""
-OURS = ("data.task", "data.data", "data.skill", "data.relabelled", "data.cache", "data.seed", "ckpt_path", "config")
-OURS += ("seed_everything", "trainer.default_root_dir", "checkpoint.dirpath", "print_config", "json")
+OURS = (
+    *("data.task", "data.data", "data.skill", "data.relabelled", "data.cache", "data.seed", "ckpt_path", "config"),
+    *("seed_everything", "trainer.default_root_dir", "checkpoint.dirpath", "print_config", "json"),
+)
 """Settings of a stage that the study sets itself."""
 BUDGETS = (
     "trainer.max_steps",
@@ -190,8 +192,12 @@ def read_study(path: Path, scale: float = 1.0) -> Study:
             raise UserError(f"{path}: {key} is missing or empty")
     if isinstance(methods := found.get("methods"), str):
         found["methods"] = list(METHODS) if methods == "all" else [methods]
-    lists = {key: tuple(found.pop(key)) for key in ("tasks", "methods", "seeds", "rows", "columns") if key in found}
-    numbers = {key: _numbers(found.pop(key)) for key in ("settings", "grid", "variants") if key in found}
+    lists: dict[str, Any] = {
+        key: tuple(found.pop(key)) for key in ("tasks", "methods", "seeds", "rows", "columns") if key in found
+    }
+    numbers: dict[str, Any] = {
+        key: _numbers(found.pop(key)) for key in ("settings", "grid", "variants") if key in found
+    }
     study = Study(**found, **lists, **numbers, scale=scale)
     try:
         _check(study)

@@ -217,7 +217,7 @@ def needed(nodes: Mapping[str, Node], done: set[str]) -> dict[str, Node]:
     """
     read = {inner.key for node in nodes.values() for inner in node.reads.values()}
     wanted = {key for key in nodes if key not in read}
-    for key in reversed(nodes):
+    for key in reversed(list(nodes)):
         if key in wanted and key not in done:
             wanted |= {inner.key for inner in nodes[key].reads.values()}
     return {key: node for key, node in nodes.items() if key in wanted - done}

@@ -143,5 +143,5 @@ def _planned(asked: Asked, study: Study, cells: Mapping[str, tuple[Cell, Node]],
         kinds[node.kind] = kinds.get(node.kind, 0) + 1
     budget = f"; stated budget: {duration(60 * study.budget * study.scale)} of one core" if study.budget else ""
     told = ", ".join(f"{count} {kind}" for kind, count in kinds.items()) or "nothing"
-    lines = [f"{study.title}: {len(cells)} cells{budget}", f"to do: {told}"]
+    lines: list[Any] = [f"{study.title}: {len(cells)} cells{budget}", f"to do: {told}"]
     return Report({"title": study.title, "cells": len(cells), "jobs": kinds, "done_before": len(done)}, lines)

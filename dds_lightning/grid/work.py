@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from dds_lightning.rollout.play import rollout
 from dds_lightning.saving.run_directory import Done
 from dds_lightning.study.protocol import BEST, LAST, best_facts
 from dds_lightning.tasks import get_task
-from dds_lightning.training.stage_cli import command, command_line
+from dds_lightning.training.stage_cli import command
 from dds_lightning.training.stages import STAGES
 
 Facts = Mapping[str, Any]
@@ -70,7 +71,7 @@ def train(settings: Facts, how: Facts, reads: Reads, folder: Path, resuming: boo
         if "watch" not in settings:  # the preset itself keeps the best, by a loss
             made["checkpoint"] = made.pop("best")
     metrics = {name: round(value, 6) for name, value in fitted["metrics"].items()}
-    return {**made, "steps": fitted["steps"], "metrics": metrics, "command": command_line(stage, words)}
+    return {**made, "steps": fitted["steps"], "metrics": metrics, "command": shlex.join(["dds", stage, *words])}
 
 
 def evaluate(settings: Facts, how: Facts, reads: Reads, folder: Path, resuming: bool) -> Facts:

@@ -2,9 +2,20 @@
 
 import math
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+
+
+def in_full_precision(x: Tensor) -> AbstractContextManager[Any]:
+    """Inside a training in bfloat16, leave it for an operation on `x` whose last digits count.
+
+    A value of 60 would be a multiple of 0.25, and a phase of many turns would be noise.
+    """
+    lowered = torch.is_autocast_enabled(x.device.type)  # asked, because an export would keep the context
+    return torch.autocast(x.device.type, enabled=False) if lowered else nullcontext()
 
 
 class EnsembleLinear(nn.Module):
@@ -43,7 +54,8 @@ class FourierFeatures(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (..., I) to (..., I + 2 F)."""
-        phase = x[..., : len(self.frequencies)] @ self.frequencies
+        with in_full_precision(x):
+            phase = x[..., : len(self.frequencies)] @ self.frequencies
         return torch.cat([x, phase.sin(), phase.cos()], dim=-1)
 
 
@@ -77,3 +89,12 @@ class MLP(nn.Sequential):
             layers.append(nn.ReLU())
             input_dim = hidden_dim
         super().__init__(*layers, linear(input_dim, output_dim))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Apply the layers."""
+        *hidden, last = self
+        for layer in hidden:
+            x = layer(x)
+        with in_full_precision(x):
+            out: Tensor = last(x.to(next(last.parameters()).dtype))
+        return out

@@ -11,6 +11,9 @@ from dds_lightning.saving.run_directory import Done
 from dds_lightning.tasks import Task, get_task
 from dds_lightning.training.fit import quieten
 
+Settings = dict[str, Any]
+"""What a step depends on; JSON values."""
+
 
 class Run:
     """One run directory and what was asked of it.
@@ -37,6 +40,7 @@ class Run:
             ("clone_steps", settings.clone_steps),
             ("episodes", self.episodes),
             ("episodes_per_skill", settings.episodes_per_skill),
+            ("jobs", 1 if settings.jobs is None else settings.jobs),
         ):
             if value < 1:
                 raise UserError(f"--{name} is {value}, expected at least 1")

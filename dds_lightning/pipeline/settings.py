@@ -16,7 +16,7 @@ from dds_lightning.errors import UserError
 from dds_lightning.tasks import Task, get_task, is_own
 from dds_lightning.training.alone import run_alone
 from dds_lightning.training.monitors import refuse_late_validation
-from dds_lightning.training.stage_cli import StageCLI, command_line, parsed
+from dds_lightning.training.stage_cli import StageCLI, parsed
 from dds_lightning.training.stages import STAGES, preset_configs, run_stages
 
 WATCH_EPISODES = 10
@@ -44,6 +44,7 @@ class RunSettings:
     workers: int | None = None
     until: str = "report"
     fresh: bool = False
+    jobs: int | None = None
     stages: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Training stage -> arguments for its `fit`, as a user gave them."""
 
@@ -256,7 +257,7 @@ class Trainings:
 
     def command(self, stage: str, spec: str, skill: Path | None, resume: Path | None) -> str:
         """The command line that `fit` with the same arguments is."""
-        return command_line(stage, self._words(stage, spec, skill, resume))
+        return shlex.join(["dds", stage, *self._words(stage, spec, skill, resume)])
 
     def _words(self, stage: str, spec: str, skill: Path | None, resume: Path | None) -> list[str]:
         arguments = self.arguments(stage, spec, skill)

@@ -5,26 +5,22 @@
    └──────────► clone (baseline) ────┴─► examine ──┘ └─► online, with `--until online`
 ```
 
-A new step is one more row of `STEPS`. A step may run as soon as those that it reads are done.
+A new step is one more row of `STEPS`. A step may run as soon as those that it reads are done: while the policy trains
+on one core, others train the clone and let everyone play who needs no policy (`pipeline.beside`).
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from dds_lightning.pipeline.context import Run
-from dds_lightning.study import contestants, protocol
+from dds_lightning.pipeline.context import Run, Settings
+from dds_lightning.pipeline.evaluating import evaluate, evaluation_settings, play_baselines
+from dds_lightning.study import protocol
 from dds_lightning.tasks import facts_to_keep
-
-if TYPE_CHECKING:
-    from dds_lightning.agent import DDSAgent
-
-Settings = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -38,6 +34,9 @@ class Step:
         settings: Everything that its result depends on beside `reads`; JSON values.
         work: Does it: (run, folder, whether an interrupted one goes on) to outputs (paths) and facts.
         former: `settings` as an earlier version wrote them; None where they are the same.
+        one_core: Whether the work uses one core only, so that others can be done beside it.
+        beside: Whether it may be done in a process of its own beside a step with `one_core`.
+        ahead: The part of the work that reads less and can be done earlier; not needed where this step is done.
     """
 
     name: str
@@ -46,6 +45,9 @@ class Step:
     settings: Callable[[Run], Settings]
     work: Callable[[Run, Path, bool], Mapping[str, Any]]
     former: Callable[[Run], Settings] | None = None
+    one_core: bool = False
+    beside: bool = False
+    ahead: Step | None = None
 
 
 # ---------------------------------------------------------------------- data
@@ -96,7 +98,13 @@ def _data(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
 
 
 def training_step(
-    stage: str, reads: tuple[str, ...], title: Callable[[Run, Settings], str], best: str = "", publish: bool = False
+    stage: str,
+    reads: tuple[str, ...],
+    title: Callable[[Run, Settings], str],
+    best: str = "",
+    publish: bool = False,
+    one_core: bool = False,
+    beside: bool = False,
 ) -> Step:
     """The step that trains a stage.
 
@@ -107,6 +115,8 @@ def training_step(
         best: What a best checkpoint is, where one was kept: "replaces" the last one for the steps that follow, or is
             told "beside" it.
         publish: Whether the trained policy and its skills become an agent of their own in the step's folder.
+        one_core: As of a `Step`.
+        beside: As of a `Step`.
     """
     return Step(
         stage,
@@ -115,6 +125,8 @@ def training_step(
         lambda run: run.trainings.cache_key_settings(stage),
         partial(_fit, stage, best, publish),
         lambda run: run.trainings.former_settings(stage),
+        one_core,
+        beside,
     )
 
 
@@ -187,89 +199,6 @@ def _examine(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
     }
 
 
-def _evaluation_settings(run: Run) -> Settings:
-    wanted = run.wanted
-    settings: Settings = {
-        **facts_to_keep(run.task),
-        "seed": wanted.seed,
-        "episodes": run.episodes,
-        "episodes_per_skill": wanted.episodes_per_skill,
-        "selection": wanted.selection,
-        "temperature": wanted.temperature,
-    }
-    return settings if wanted.noise_scale is None else {**settings, "noise_scale": wanted.noise_scale}
-
-
-def _evaluate(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
-    """Publish the agent and let everyone in the table play."""
-    from dds_lightning.agent import DDSAgent
-    from dds_lightning.baselines.behaviour_cloning import CloneActor
-    from dds_lightning.console.reports import plain
-    from dds_lightning.policy import PolicyModule
-    from dds_lightning.rollout.play import rollout
-    from dds_lightning.skill import SkillModule
-
-    wanted, task = run.wanted, run.task
-    chosen: dict[str, Any] = run.facts("policy").get("chosen", {})
-    skill = SkillModule.load(run.output("skill", "checkpoint"))
-
-    def agent_of(checkpoint: str, way: Any = wanted.selection, alpha: float | None = None) -> DDSAgent:
-        policy = PolicyModule.load(run.output("policy", checkpoint))
-        policy.hparams.alpha = policy.hparams.alpha if alpha is None else alpha
-        return DDSAgent(skill, policy, way, wanted.temperature, wanted.noise_scale, seed=wanted.seed)
-
-    agent = agent_of("checkpoint")
-    best = agent_of("best") if chosen else None
-    closed = agent.policy is not None and agent.policy.hparams.awr == "closed_form"
-    players = contestants.final_contestants(
-        agent,
-        task,
-        run.episodes,
-        wanted.episodes_per_skill,
-        clone=CloneActor.load(run.output("clone", "checkpoint")),
-        controller=contestants.behaviour_controller(task) if wanted.data is None else None,
-        best=contestants.best_ways(best, run.episodes, chosen) if best else (),
-        data_policy=agent_of("checkpoint", "sample", alpha=0.0) if closed else None,
-    )
-    result = rollout(task, players, seed=wanted.seed, workers=wanted.workers, record=True)
-    result.save(folder)
-    results = json.loads(result.summary().round(4).to_json(orient="records"))  # NaN becomes null
-    metrics = {"episodes": run.episodes, "seed": wanted.seed, "results": results}
-    kept = facts_to_keep(task)
-    made: dict[str, Any] = {
-        "protocol": protocol.protocol(
-            task, agent, episodes=run.episodes, seed=wanted.seed, temperature=wanted.temperature, best=chosen
-        ),
-        "start_value": plain(protocol.start_value(task, agent, wanted.seed)),
-        "agent": agent.save(run.out / "agent", metrics=metrics, card=_card(run, result.episodes), **kept),
-    }
-    if best:
-        place = run.out / contestants.BEST_AGENT
-        made["best"] = best.save(place, metrics=metrics, **kept, checkpoint=chosen)
-    return {"episodes": folder / "episodes.parquet", **made, "results": results}
-
-
-def _card(run: Run, episodes: Any) -> str:
-    """The README.md of the published agent."""
-    from datamodules.collect.collectors import collection_command
-    from dds_lightning.study.card import agent_card
-
-    wanted = run.wanted
-    command = f"dds data collect {run.task.name} --steps {wanted.data_steps} --seed {wanted.seed}"
-    source = f"collected by `{command}`"
-    if wanted.data is not None:
-        known = collection_command(wanted.data.removeprefix("local:")) if wanted.data.startswith("local:") else None
-        source = f"collected by `{known}` ({wanted.data})" if known else wanted.data
-    return agent_card(
-        run.task,
-        episodes,
-        seed=wanted.seed,
-        data={"source": source, **run.facts("data")["facts"]},
-        settings={stage: run.trainings.settings(stage) for stage in ("skill", "policy")},
-        command=wanted.command(),
-    )
-
-
 def _write_report(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
     """Draw what a person looks at."""
     from dds_lightning.study.report import write_report
@@ -301,11 +230,13 @@ STEPS: dict[str, Step] = {
             ("data", "skill", "relabel"),
             lambda run, settings: f"policy: {settings['trainer']['max_steps']:,} steps",
             best="beside",
+            one_core=True,
         ),
         training_step(
             "clone",
             ("data",),
             lambda run, settings: f"clone: behaviour cloning, the baseline, {run.wanted.clone_steps:,} steps",
+            beside=True,
         ),
         Step(
             "examine",
@@ -318,8 +249,16 @@ STEPS: dict[str, Step] = {
             "evaluate",
             ("skill", "policy", "clone"),
             lambda run: f"evaluate: {run.episodes} episodes each, in the real environment",
-            _evaluation_settings,
-            _evaluate,
+            evaluation_settings,
+            evaluate,
+            ahead=Step(
+                "baselines",
+                ("skill", "clone"),
+                lambda run: f"evaluate: those that need no policy, {run.episodes} episodes each",
+                evaluation_settings,
+                play_baselines,
+                beside=True,
+            ),
         ),
         Step(
             "report",
@@ -333,7 +272,16 @@ STEPS: dict[str, Step] = {
             ("data", "skill", "relabel"),
             lambda run, settings: f"online: SAC over the skills, {settings['trainer']['max_steps']:,} steps",
             publish=True,
+            beside=True,
         ),
     )
 }
 """Name -> step, each after those that it reads."""
+
+
+def every_step() -> Iterator[Step]:
+    """The steps, and before each its part that can be done ahead."""
+    for step in STEPS.values():
+        if step.ahead is not None:
+            yield step.ahead
+        yield step

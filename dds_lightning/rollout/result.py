@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -94,6 +94,13 @@ class RolloutResult:
                 }
             )
         return pd.DataFrame(rows)
+
+    def joined(self, other: RolloutResult, order: Sequence[str]) -> RolloutResult:
+        """This table and that of other contestants who played the same episodes, with the actors in `order`."""
+        place = {name: i for i, name in enumerate(order)}
+        episodes = pd.concat([self.episodes, other.episodes], ignore_index=True)
+        episodes = episodes.sort_values("actor", key=lambda names: names.map(place), kind="stable", ignore_index=True)
+        return RolloutResult(self.task, episodes, {**self.paths, **other.paths})
 
     def save(self, directory: str | Path) -> Path:
         """Write `episodes.parquet` and, when recorded, `paths.npz`; each file whole or not at all."""

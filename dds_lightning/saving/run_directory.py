@@ -106,12 +106,8 @@ class RunDirectory:
         Raises:
             UserError: A newer version of this package did the step; nothing is touched.
         """
-        folder = self.root / name
-        expected = {"settings": _json(settings), "inputs": {stage.name: stage.digest for stage in reads}}
-        marker = read_marker(folder)
-        there = {key: marker.get(key) for key in expected}
-        same = there in (expected, {**expected, "settings": _json(settings if former is None else former)})
-        if same and marker.get("state") == "finished" and not self.fresh and (found := _found(folder, marker)):
+        folder, marker, expected, same = self._look(name, settings, reads, former)
+        if found := self._finished(folder, marker, same):
             self._say(f"{title}: done before, in {duration(found.seconds)}", "dim")
             self.done.append(found)
             return found
@@ -150,6 +146,32 @@ class RunDirectory:
         self._say(f"{title}: {duration(seconds)}", "green")
         self.done.append(result)
         return result
+
+    def find(
+        self,
+        name: str,
+        settings: Mapping[str, Any],
+        reads: Sequence[Done],
+        former: Mapping[str, Any] | None = None,
+    ) -> Done | None:
+        """The step if it is done; arguments as of `do`, which would find it."""
+        folder, marker, _, same = self._look(name, settings, reads, former)
+        return self._finished(folder, marker, same)
+
+    def _look(
+        self, name: str, settings: Mapping[str, Any], reads: Sequence[Done], former: Mapping[str, Any] | None
+    ) -> tuple[Path, dict[str, Any], dict[str, Any], bool]:
+        """A step's folder, its marker, what a marker of this call would say, and whether they say the same."""
+        folder = self.root / name
+        expected = {"settings": _json(settings), "inputs": {stage.name: stage.digest for stage in reads}}
+        marker = read_marker(folder)
+        there = {key: marker.get(key) for key in expected}
+        same = there in (expected, {**expected, "settings": _json(settings if former is None else former)})
+        return folder, marker, expected, same
+
+    def _finished(self, folder: Path, marker: dict[str, Any], same: bool) -> Done | None:
+        usable = same and marker.get("state") == "finished" and not self.fresh
+        return _found(folder, marker) if usable else None
 
     def _say(self, text: str, style: str) -> None:
         self.console.print(text, style=style, highlight=False, markup=False)

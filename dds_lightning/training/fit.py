@@ -25,6 +25,8 @@ from dds_lightning.errors import UserError, is_out_of_memory, reason
 from dds_lightning.module import StageModule
 from dds_lightning.saving.checkpoint import load_ckpt
 from dds_lightning.training.stages import Stage, get_stage
+from dds_lightning.training.threads import settle_threads
+from dds_lightning.training.trainer import THREADS, TrainingSettings
 
 _CONNECTOR = "checkpoint_connector.py"
 """Where Lightning restores the state of a training at its start."""
@@ -55,6 +57,7 @@ def fit(
     module: StageModule,
     data: pl.LightningDataModule,
     checkpoint: str | Path | None = None,
+    threads: int | None = None,
 ) -> Fitted:
     """Train a stage.
 
@@ -63,6 +66,7 @@ def fit(
         module: Of one of the registered stages.
         data: What it learns from.
         checkpoint: `.ckpt` to go on from; None starts.
+        threads: Of torch; None takes the stage's own number, or as many as `settle_threads` finds worth it.
 
     Raises:
         UserError: Data or settings that cannot work, or memory that does not suffice.
@@ -78,7 +82,7 @@ def fit(
         with (
             resuming(checkpoint),
             advice_on_memory(trainer, module, data),
-            torch_threads(stage.threads),
+            torch_threads(_keep(threads or stage.threads or settle_threads(trainer, module, data), trainer)),
             waits,
         ):
             trainer.fit(module, datamodule=data, ckpt_path=checkpoint, weights_only=True)
@@ -101,6 +105,14 @@ def fit(
     if path is None and saved and checkpoint is not None:
         path = Path(checkpoint)  # it had been trained for so many steps already
     return Fitted(path, best or None, trainer.global_step, metrics, trainer.log_dir)
+
+
+def _keep(threads: int | None, trainer: pl.Trainer) -> int | None:
+    """Let every checkpoint say with how many threads its training runs: with others, sums round otherwise."""
+    for callback in trainer.callbacks:  # type: ignore[attr-defined]
+        if isinstance(callback, TrainingSettings) and threads is not None:
+            callback.settings[THREADS] = threads
+    return threads
 
 
 @contextlib.contextmanager

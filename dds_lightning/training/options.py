@@ -45,6 +45,9 @@ GENERAL = {
         None,
         "auto: measure whether bfloat16 is faster here; --trainer.precision overrules it.",
     ),
+    "threads": Parameter(
+        "threads", int | None, None, "Threads of torch; without it, as many as a short measurement finds worth it."
+    ),
     "print_config": Parameter("print_config", inspect.Parameter.empty, None, "Print all settings as YAML and end."),
     "json": Parameter("json", inspect.Parameter.empty, None, "Print one JSON document and nothing else."),
 }

@@ -7,7 +7,6 @@
 - A mistake in the data is found before the first file is written.
 """
 
-import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -42,7 +41,8 @@ from dds_lightning.training.resuming import (
     requeued_checkpoint,
 )
 from dds_lightning.training.stages import get_stage
-from dds_lightning.training.trainer import TrainingSettings, log_places, trainer_settings, trial_trainer
+from dds_lightning.training.threads import HELP, refuse_threads
+from dds_lightning.training.trainer import THREADS, TrainingSettings, log_places, trainer_settings, trial_trainer
 
 PLACES = ("data", "skill", "relabelled", "cache", "device_resident")
 """Settings of the data that say where they are; a training may go on with them elsewhere."""
@@ -60,8 +60,8 @@ class StageCLI(LightningCLI):
     def __init__(self, stage: str, arguments: Sequence[str], parse_only: bool = False) -> None:
         self.stage = get_stage(stage)
         self.parse_only = parse_only
-        options = list_options(self.stage.module_class(), "model.") | list_options(self.stage.data_class(), "data.")
-        self.arguments = as_lists(resolve_configs(arguments), options)
+        lists = list_options(self.stage.module_class(), "model.") | list_options(self.stage.data_class(), "data.")
+        self.arguments = as_lists(resolve_configs(arguments), lists)
         self.checkpoint: dict[str, Any] | None = None
         self.measured_precision: str | None = None
         try:
@@ -102,6 +102,7 @@ class StageCLI(LightningCLI):
         parser.add_lightning_class_args(AverageWeights, "average")
         parser.add_lightning_class_args(Convergence, "stop")
         parser.add_argument("--precision", type=Literal["auto"] | None, default=None, help=OVERRULED)
+        parser.add_argument("--threads", type=int | None, default=None, help=HELP)
         parser.add_argument("--json", action="store_true", help="print one JSON document and nothing else")
         for name in self.stage.links:
             parser.link_arguments(f"data.{name}", f"model.{name}", apply_on="instantiate")
@@ -116,6 +117,7 @@ class StageCLI(LightningCLI):
         self.config = parser.parse_args(args)
         expand_paths(self.settings)
         data = self.settings.data
+        refuse_threads(self.settings.threads)
         refuse_seed("--seed_everything", int(self.settings.seed_everything))
         if "seed" in data:
             data.seed = int(self.settings.seed_everything) if data.seed is None else data.seed
@@ -164,6 +166,8 @@ class StageCLI(LightningCLI):
         if self.config.subcommand == "fit":  # one may look at a model with other data
             trained |= self.checkpoint.get(TrainingSettings.KEY, {})
         chosen = self._chosen()
+        if (threads := trained.pop(THREADS, None)) is not None and THREADS not in chosen:
+            settings[THREADS] = min(int(threads), torch.get_num_threads())
         task = trained.get("data.task")
         if task and is_address(task) and "data.task" not in chosen:  # a file decides neither what is opened nor run
             raise UserError(f"checkpoint {path} was trained for task {task}: give --data.task={task} again")
@@ -277,7 +281,7 @@ class StageCLI(LightningCLI):
             return work(**self._prepare_subcommand_kwargs(str(self.subcommand)))
 
     def _fit(self) -> Report:
-        made = fit(self.trainer, self.model, self.datamodule, self.settings.get("ckpt_path"))
+        made = fit(self.trainer, self.model, self.datamodule, self.settings.get("ckpt_path"), self.settings.threads)
         saved = {"checkpoint": made.checkpoint, "best": made.best}
         lines: list[Any] = [f"{made.steps:,} steps; logs in {log_places(self.trainer)}"]
         if self.checkpoint is not None and 0 <= self.trainer.max_steps <= self.checkpoint["global_step"]:
@@ -314,12 +318,11 @@ class StageCLI(LightningCLI):
         name = self.model.PREDICTION
         columns = [name] if values.ndim == 1 else [f"{name} {j}" for j in range(values.shape[1])]
         pd.DataFrame(values, columns=columns).to_parquet(path)
-        data: dict[str, Any] = {"file": path, "rows": len(values)}
         if name != "code":
-            return Report(data, [str(path)])
+            return Report({"file": path, "rows": len(values)}, [str(path)])
         counts = pd.Series(values).value_counts().sort_index()
         usage = pd.DataFrame({"code": counts.index, "count": counts.to_numpy()})
-        return Report({**data, "codes": usage}, [table(usage), str(path)])
+        return Report({"file": path, "rows": len(values), "codes": usage}, [table(usage), str(path)])
 
 
 def command(stage: str, arguments: Sequence[str]) -> Callable[[], Report]:
@@ -344,8 +347,3 @@ def parsed(stage: str, arguments: Sequence[str]) -> StageCLI:
         UserError: Arguments that `dds STAGE fit` does not understand.
     """
     return StageCLI(stage, arguments, parse_only=True)
-
-
-def command_line(stage: str, arguments: Sequence[str]) -> str:
-    """The command a person would type for these arguments."""
-    return shlex.join(["dds", stage, *arguments])

@@ -72,6 +72,8 @@ _SKILL_LOSSES = "loss denoising codebook commitment kl perplexity codes_used"
 _POLICY_TERMS = (
     "value_loss q_loss actor_loss v_mean v_min v_max q_mean advantage_std clipped_share effective_sample_size"
 )
+
+
 def _baseline(
     name: str,
     description: str,

@@ -30,6 +30,8 @@ QUIET_LOGGERS = ("CSVLogger", "TensorBoardLogger", "WandbLogger", "MLFlowLogger"
 CLUSTERS = ("MASTER_ADDR", "SLURM_NTASKS", "LSB_JOBID", "OMPI_COMM_WORLD_SIZE")
 """Variables by which Lightning finds the other nodes."""
 HALF = ("16-true", "bf16-true", "transformer-engine", "transformer-engine-float16")
+THREADS = "threads"
+"""Entry of a checkpoint's settings, and the setting of the command line."""
 RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ("val_check_interval", lambda value: value != 0, "a number of batches, a share of an epoch, or a time"),
     ("check_val_every_n_epoch", lambda value: value >= 1, "at least 1, or null to count batches across epochs"),

@@ -47,3 +47,20 @@ def test_fourier_features_are_the_input_and_sines_and_cosines_of_its_leading_num
     torch.testing.assert_close(features(x), torch.cat([x, phase.sin(), phase.cos()], dim=-1))
     assert features(x).shape[-1] == features.output_dim == 11
     assert FourierFeatures(3, 4000, scale=2.0).frequencies.std().item() == pytest.approx(2.0, rel=0.05)
+
+
+def test_in_bfloat16_the_last_layer_and_phases_keep_all_digits():
+    """A value of 60 would be a multiple of 0.25: one skill of many in a maze brings less."""
+    torch.manual_seed(0)
+    for net, x in ((MLP(4, 2, [32]), torch.randn(5, 4)), (MLP(4, 2, [32], members=2), torch.randn(2, 5, 4))):
+        with torch.no_grad():
+            net[-1].bias += 60.0
+        exact = net(x)
+        with torch.autocast("cpu", torch.bfloat16):
+            lowered = net(x)
+        assert lowered.dtype == torch.float32
+        assert 0 < (lowered - exact).abs().max() < 0.01
+    features, x = FourierFeatures(2, 8, scale=20.0), 10.0 * torch.randn(5, 2)
+    exact = features(x)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(features(x), exact)

@@ -20,7 +20,7 @@ from dds_lightning.pipeline.settings import RunSettings, Trainings
 from dds_lightning.skill import SkillModule
 from dds_lightning.tasks import get_task
 from dds_lightning.training import alone
-from tests.fits import QUIET, SKILL, TASK, of_data
+from tests.fits import QUIET, SKILL, TASK, of_data, skill_of
 
 ROOT = Path(__file__).parents[2]
 SMALL = {"hidden_dim": 16, "skill_dim": 8, "encoder_layers": 1, "encoder_heads": 2, "decoder_blocks": 1}
@@ -161,6 +161,49 @@ def test_two_processes_train_and_report_once(strategy, tmp_path_factory):
     saved = torch.load("out/last.ckpt", weights_only=True)
     assert saved["global_step"] == 30
     assert len(saved["rng"]) == 2
+
+
+RANKS = ["--trainer.callbacks+=tests.training.ranks.KeepRank", *TWO, "--trainer.strategy=ddp", "--trainer.max_steps=12"]
+
+
+def refuse_differences():
+    """Refuse two processes that differ in any weight or buffer, at the start or at the end; return the end."""
+    ranks = [torch.load(f"rank-{rank}.pt", weights_only=True) for rank in (0, 1)]
+    for first, second in zip(*ranks, strict=True):
+        assert first.keys() == second.keys()
+        assert [name for name in first if not torch.equal(first[name], second[name])] == []
+    return ranks[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ema", ["null", "0.9"])
+def test_two_processes_have_one_codebook_from_its_start_through_every_restart(ema, tmp_path_factory):
+    """Start by k-means, moving averages, usage and revived codes, each from what both processes see."""
+    data = of_data(tmp_path_factory.mktemp("data"))
+    words = [*data, *QUIET, *SKILL, *RANKS, "--checkpoint.dirpath=out", f"--model.codebook_ema={ema}"]
+    words += ["--model.restart_every=2", "--model.restart_threshold=1.5", "--model.codebook_init=kmeans"]
+    dds("skill", "fit", *words, "--json")
+    start, end = refuse_differences()
+    assert bool(start["bottleneck.initted"])
+    moved = (start["bottleneck.vectors"] != end["bottleneck.vectors"]).any(dim=1)
+    assert bool(moved.all())
+    assert torch.isfinite(end["bottleneck.vectors"]).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("extraction", ["joint", "after"])
+def test_two_processes_have_one_policy(extraction, tmp_path_factory):
+    root = tmp_path_factory.mktemp("data")
+    data = of_data(root)
+    skill = skill_of(data, root / "skill", 5)
+    words = [*data, *QUIET, *RANKS, f"--data.skill={skill}"]
+    words += ["--model.hidden_dims=[16]", f"--model.extraction={extraction}", "--model.critic_steps=6"]
+    words += ["--model.alpha_unit=spread", "--checkpoint.dirpath=out"]
+    dds("policy", "fit", *words, "--json")
+    start, end = refuse_differences()
+    learnt = [name for name in start if name.startswith(("actor.", "critic.", "value.", "target_critic."))]
+    assert all(not torch.equal(start[name], end[name]) for name in learnt)
+    assert float(end["advantage_spread"]) != 1.0
 
 
 @pytest.mark.slow
