@@ -10,7 +10,7 @@ from dds_lightning.grid.nodes import Node
 def sleep(settings, how, reads, folder, resuming):
     """Count up to `seconds`, a tenth at a time; what was counted survives a kill, as a checkpoint does."""
     state = folder / "state.txt"
-    begun = int(state.read_text()) if resuming and state.exists() else 0
+    begun = int(state.read_text() or 0) if resuming and state.exists() else 0
     for tenth in range(begun, round(10 * settings["seconds"])):
         time.sleep(0.1)
         state.write_text(str(tenth + 1))
