@@ -75,8 +75,8 @@ ROOMS = {
     "datamodules.inspection datamodules.trajectories",
     "dds_lightning.interpret.atlas": "interpret.draw interpret.measure interpret.views rollout saving tasks "
     "datamodules.trajectories",
-    "dds_lightning.study": "agent callbacks console errors interpret.atlas interpret.draw interpret.measure online "
-    "policy rollout saving skill tasks datamodules.collect datamodules.relabel datamodules.relabelling "
+    "dds_lightning.study": "agent callbacks configs console errors interpret.atlas interpret.draw interpret.measure "
+    "online policy rollout saving skill tasks datamodules.collect datamodules.relabel datamodules.relabelling "
     "datamodules.sources",
     "dds_lightning.sharing": "agent errors saving tasks training",
     "dds_lightning.pipeline": "agent baselines configs console envs errors interpret.draw online policy rollout saving "

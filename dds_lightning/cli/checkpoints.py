@@ -51,7 +51,8 @@ def publish(
     chosen = None if task is None else get_task(task)
     text = None if card is None else _text(card)
     if parts:
-        agent, chosen = loose_agent(skill, policy), loose_task(task, policy, skill)
+        chosen = loose_task(task, policy, skill)
+        agent = loose_agent(skill, policy, chosen)
         about, metrics = {"task": None} if chosen is None else facts_to_keep(chosen), None
     else:
         source = agent_directory(Path(run))

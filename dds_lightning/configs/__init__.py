@@ -23,6 +23,11 @@ def packaged() -> list[str]:
     return sorted(str(path.relative_to(ROOT)) for path in ROOT.rglob("*.yaml") if path.name != "run.yaml")
 
 
+def families() -> set[str]:
+    """Names of the packaged presets."""
+    return {path.parent.name for path in ROOT.glob("*/skill.yaml")}
+
+
 def find(name: str) -> Path:
     """Find a configuration: the user's file, or else a packaged one.
 

@@ -60,7 +60,7 @@ def evaluate(
     chosen = {"noise_scale": noise_scale, "hold": hold}
     acting: dict[str, Any] = {"seed": seed, **{name: value for name, value in chosen.items() if value is not None}}
     agents = {
-        kind: loose_agent(skill, policy, **acting) if skill else DDSAgent.load(place, **acting)
+        kind: loose_agent(skill, policy, wanted, **acting) if skill else DDSAgent.load(place, **acting)
         for kind, place in places.items()
     }
     for kind, agent in agents.items():

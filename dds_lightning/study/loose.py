@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from dds_lightning.agent import DDSAgent
+from dds_lightning.configs import families, run_defaults
 from dds_lightning.errors import UserError
 from dds_lightning.online.parts import checkpoint_parts
 from dds_lightning.saving.checkpoint import load_ckpt, stage_of, trained_for
@@ -14,17 +15,21 @@ from dds_lightning.tasks import Task, get_task, known_task, restore_task
 from dds_lightning.tasks.own import is_address
 
 
-def loose_agent(skill: str | None, policy: str | None = None, **acting: Any) -> DDSAgent:
+def loose_agent(skill: str | None, policy: str | None = None, task: Task | None = None, **acting: Any) -> DDSAgent:
     """Put a skill checkpoint and a policy checkpoint together.
 
     Args:
         skill: A `.ckpt` or a published directory; None for raw actions.
         policy: Likewise, offline or online; None for an agent that chooses its skills at random.
+        task: What it plays; where `acting` does not say it, the decoder's noise is that of the task's preset, as in
+            `dds run`.
         **acting: Settings of the agent.
 
     Raises:
         UserError: A file cannot be read, or the two do not belong together.
     """
+    if task is not None and skill is not None and acting.get("noise_scale") is None and task.family in families():
+        acting["noise_scale"] = run_defaults(task.family)["noise_scale"]
     return DDSAgent(*checkpoint_parts(skill, policy), "random" if policy is None else "sample", **acting)
 
 

@@ -7,6 +7,8 @@ import pytest
 from dds_lightning.cli import main
 from dds_lightning.cli.parser import prepare
 from dds_lightning.saving.published import load_published
+from dds_lightning.skill import SkillModule
+from dds_lightning.study.loose import loose_agent
 from dds_lightning.tasks import get_task
 from tests.fits import POLICY, QUIET, call, of_data, skill_of, told
 
@@ -40,6 +42,16 @@ def test_they_play_in_the_task_that_they_were_trained_for(trained, capsys):
     assert [row["actor"] for row in found["results"]] == ["AWR policy, greedy"]
     other = answer(capsys, *words, "--selection=random", "--task", "pointmaze-umaze-diverse")
     assert other["protocol"]["task"] == "pointmaze-umaze-diverse"
+
+
+@pytest.mark.parametrize(("task", "noise"), [("kitchen-mixed", 0.0), ("hopper-medium", 0.5), (TASK, None)])
+def test_their_noise_is_that_of_the_tasks_preset_as_in_a_run(trained, task, noise):
+    skill, policy, _ = map(str, trained)
+    usual = SkillModule.load(skill).hparams.noise_scale
+    agent = loose_agent(skill, policy, get_task(task))
+    assert agent.noise_scale == (usual if noise is None else noise)
+    assert loose_agent(skill, policy, get_task(task), noise_scale=0.7).noise_scale == 0.7
+    assert loose_agent(skill, policy).noise_scale == usual
 
 
 def test_they_are_published_with_it_and_the_agent_knows_its_goal(trained, capsys, tmp_path):
