@@ -147,7 +147,7 @@ plot_strobes(task, frames, every=13, title="one second of a medium episode (0) a
 #
 # **Third difference: the amount of training.** The paper's exact settings are shipped (`--preset paper`); according to
 # the paper the skills alone took two and a half hours on an RTX 4090. The preset for this body is designed for two CPU
-# cores (`--preset locomotion`): a budget of 24,000 steps for the skills, which ends earlier where their held-out loss
+# cores (`--preset locomotion`): a budget of 40,000 steps for the skills, which ends earlier where their held-out loss
 # levels off. This notebook uses a fraction of it, at higher learning rates, with one layer less in the encoder and
 # narrower networks in the policy. (Below, a dash stands for the default of the module: two hidden layers of 256.)
 #
