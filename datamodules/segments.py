@@ -207,7 +207,7 @@ class SegmentDataModule(pl.LightningDataModule):
 
     def _loader(self, segments: NDArray[np.int64], **options: Any) -> TensorLoader:
         assert self._windows is not None
-        device = self._device()
+        device = self._place()
         observations, actions = self._tensors(device)
         first_rows = torch.from_numpy(self._windows.observation_starts[segments]).to(device)
         first_steps = torch.from_numpy(self._windows.starts[segments]).to(device)
@@ -221,7 +221,7 @@ class SegmentDataModule(pl.LightningDataModule):
 
         return TensorLoader(gather, len(segments), self.batch_size, device=device, **options)
 
-    def _device(self) -> torch.device:
+    def _place(self) -> torch.device:
         if self.device_resident and self.trainer is not None:
             return self.trainer.strategy.root_device
         return torch.device("cpu")

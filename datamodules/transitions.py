@@ -64,7 +64,7 @@ class TransitionDataModule(SegmentDataModule):
 
     def _loader(self, segments: NDArray[np.int64], **options: Any) -> TensorLoader:
         assert self._windows is not None
-        device = self._device()
+        device = self._place()
         observations, _ = self._tensors(device)
         w, settled = self._windows, self.relabelling.for_task(self.task)
         learning = settled.learning_rewards(self.trajectories, self.horizon)
@@ -238,7 +238,7 @@ class SequenceDataModule(SegmentDataModule):
 
     def _loader(self, segments: NDArray[np.int64], **options: Any) -> TensorLoader:
         assert self._windows is not None
-        device = self._device()
+        device = self._place()
         observations, actions = self._tensors(device)
         rewards, returns = (torch.as_tensor(x, dtype=torch.float32, device=device) for x in self._rewards())
         lengths, offsets = self.trajectories.lengths, self.trajectories.step_offsets

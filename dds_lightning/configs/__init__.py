@@ -20,7 +20,8 @@ RUN_DEFAULTS: dict[str, Any] = {
 
 def packaged() -> list[str]:
     """Names of all packaged configurations, as `--config` takes them."""
-    return sorted(str(path.relative_to(ROOT)) for path in ROOT.rglob("*.yaml") if path.name != "run.yaml")
+    found = (path.relative_to(ROOT) for path in ROOT.rglob("*.yaml") if path.name != "run.yaml")
+    return sorted(str(path) for path in found if path.parent.name != "studies")
 
 
 def families() -> set[str]:
@@ -75,7 +76,7 @@ def preset_folder(name: str) -> Path:
     """
     folder = Path(name) if Path(name).is_dir() else ROOT / name
     if not folder.is_dir():
-        known = ", ".join(sorted({Path(entry).parent.name for entry in packaged() if "/" in entry}))
+        known = ", ".join(sorted(families()))
         raise UserError(f"preset: there is no folder {name}, and the packaged ones are {known}")
     return folder
 

@@ -44,7 +44,8 @@ def _do_steps(run: Run) -> None:
     """Do the steps in their order, and those that may be done beside others as soon as there is a core for them."""
     directory, told = (RunDirectory(run.out, console, run.wanted.fresh) for console in (run.console, Lines()))
     names = list(STEPS)
-    steps = [STEPS[name] for name in names[: names.index(run.wanted.until) + 1]]
+    last = names.index(run.wanted.until) if run.wanted.until in names else len(names)
+    steps = [STEPS[name] for name in names[: last + 1]]
     parts = [part for step in steps for part in (step.ahead, step) if part is not None and part.beside]
 
     # Here and not when they begin: parsers and filters of warnings are not made for two threads.

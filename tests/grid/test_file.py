@@ -68,7 +68,7 @@ def test_packaged_studies_can_be_planned(name):
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ({"methods": ["ddss"]}, r"methods: there is no method ddss: did you mean dds\?"),
+        ({"methods": ["ddss"]}, r"methods: there is no method ddss: did you mean dds"),
         ({"tasks": ["pointmaze-umase-diverse"]}, "pointmaze-umase-diverse"),
         ({"tasks": []}, "tasks is missing or empty"),
         ({"grid": {"skill.model.num_skills": []}}, r"skill.model.num_skills is \[\], expected a list of one or more"),

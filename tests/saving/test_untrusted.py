@@ -48,6 +48,8 @@ ELSEWHERE = {
     "dds_lightning/examples/act_with_onnx.py": {"json.loads"},  # runs without this package, on a file of one's own
     "datamodules/behaviours/training/publish.py": {"pd.read_csv"},  # the curve of one's own training
     "datamodules/behaviours/training/learner.py": {"torch.load"},  # the state of one's own interrupted training
+    "dds_lightning/grid/engines.py": {"json.loads"},  # the answer of its own worker, through a private pipe
+    "dds_lightning/grid/worker.py": {"json.loads"},  # the jobs that come the other way
     "dds_lightning/envs/worker.py": {"pickle.loads"},  # what its own caller sends through a private pipe
 }
 

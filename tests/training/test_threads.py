@@ -113,7 +113,7 @@ def test_no_thread_at_all_is_refused(dds, count):
 
 def test_stages_of_small_networks_have_a_number_of_their_own():
     assert {name: stage.threads for name, stage in STAGES.items()} == {
+        **dict.fromkeys(STAGES, 1),
         **dict.fromkeys(("skill", "policy")),
-        **dict.fromkeys(("clone", "online"), 1),
     }
     assert fitting.settle_threads is threads.settle_threads
