@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +15,16 @@ from dds_lightning.nn.diffusion import DiffusionDecoder
 from dds_lightning.nn.mlp import MLP
 
 Batch = dict[str, Tensor]
+Network = TypeVar("Network", bound=nn.Module)
 Loss = tuple[Tensor, dict[str, Tensor]]  # a scalar to minimise, and what to log
+
+
+def with_target(make: Callable[[], Network]) -> tuple[Network, Network]:
+    """A network, and one with the same weights that no gradient moves."""
+    network, target = make(), make()
+    target.load_state_dict(network.state_dict())
+    target.requires_grad_(False)
+    return network, target
 
 
 class TwinCritic(nn.Module):
@@ -28,10 +38,7 @@ class TwinCritic(nn.Module):
 
     def __init__(self, state_dim: int, choice_dim: int, hidden_dims: Sequence[int]) -> None:
         super().__init__()
-        self.online = MLP(state_dim + choice_dim, 1, hidden_dims, members=2)
-        self.target = MLP(state_dim + choice_dim, 1, hidden_dims, members=2)
-        self.target.load_state_dict(self.online.state_dict())
-        self.target.requires_grad_(False)
+        self.online, self.target = with_target(lambda: MLP(state_dim + choice_dim, 1, hidden_dims, members=2))
 
     def both(self, states: Tensor, choices: Tensor) -> Tensor:
         """Values (2, B) of choices (B, C) in states (B, O)."""
@@ -99,6 +106,18 @@ def draw(
     """
     wide = states.repeat_interleave(count, dim=0)
     return wide, decoder.sample(wide, wide[:, :0], generator=generator)
+
+
+def proposals(
+    decoder: DiffusionDecoder, critic: TwinCritic, states: Tensor, count: int, generator: torch.Generator | None = None
+) -> tuple[Tensor, Tensor]:
+    """Draw `count` choices in each state, as `draw`, and judge them.
+
+    Returns:
+        The choices, (B, count, C), and their smaller target values, (B, count).
+    """
+    wide, choices = draw(decoder, states, count, generator)
+    return choices.view(len(states), count, -1), critic.least(wide, choices).view(len(states), count)
 
 
 def take(options: Tensor, index: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 import dds_lightning.losses as losses
-from dds_lightning.baselines.critics import Batch, CriticModule, Loss, TwinCritic, draw, take
+from dds_lightning.baselines.critics import Batch, CriticModule, Loss, TwinCritic, draw, proposals, take, with_target
 from dds_lightning.nn.diffusion import DiffusionDecoder
 from dds_lightning.nn.normaliser import ActionBox, Normaliser
 
@@ -93,9 +93,7 @@ class DiffusionQL(CriticModule):
         self.action_box = ActionBox(action_dim)
         self.critic = TwinCritic(observation_dim, action_dim, hidden_dims)
         shape = (observation_dim, action_dim, 0, hidden_dim, blocks, dropout, diffusion_steps)
-        self.actor, self.target_actor = DiffusionDecoder(*shape), DiffusionDecoder(*shape)
-        self.target_actor.load_state_dict(self.actor.state_dict())
-        self.target_actor.requires_grad_(False)
+        self.actor, self.target_actor = with_target(lambda: DiffusionDecoder(*shape))
         self._begin(init_from)
 
     def loss(self, batch: Batch) -> Loss:
@@ -127,11 +125,10 @@ class DiffusionQL(CriticModule):
 
     def act(self, observations: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Actions (B, A) for observations (B, O)."""
-        x, count = self.normaliser(observations), self.hparams.samples
-        wide, proposed = draw(self.actor, x, count, generator)
-        q = self.critic.least(wide, proposed).view(len(x), count)
+        x = self.normaliser(observations)
+        proposed, q = proposals(self.actor, self.critic, x, self.hparams.samples, generator)
         index = torch.multinomial(q.softmax(dim=-1), 1, generator=generator).squeeze(-1)
-        return self.action_box.from_unit(take(proposed.view(len(x), count, -1), index))
+        return self.action_box.from_unit(take(proposed, index))
 
     def predict_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Actions (B, A) for the states of a batch."""

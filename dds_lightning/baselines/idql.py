@@ -18,7 +18,16 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-from dds_lightning.baselines.critics import Batch, CriticModule, Loss, TwinCritic, draw, implicit, take
+from dds_lightning.baselines.critics import (
+    Batch,
+    CriticModule,
+    Loss,
+    TwinCritic,
+    implicit,
+    proposals,
+    take,
+    with_target,
+)
 from dds_lightning.nn.diffusion import DiffusionDecoder
 from dds_lightning.nn.mlp import MLP
 from dds_lightning.nn.normaliser import ActionBox, Normaliser
@@ -91,9 +100,7 @@ class IDQL(CriticModule):
         self.value = MLP(observation_dim, 1, hidden_dims)
         self.critic = TwinCritic(observation_dim, action_dim, hidden_dims)
         shape = (observation_dim, action_dim, 0, hidden_dim, blocks, dropout, diffusion_steps)
-        self.actor, self.target_actor = DiffusionDecoder(*shape), DiffusionDecoder(*shape)
-        self.target_actor.load_state_dict(self.actor.state_dict())
-        self.target_actor.requires_grad_(False)
+        self.actor, self.target_actor = with_target(lambda: DiffusionDecoder(*shape))
         self._begin(init_from)
 
     def loss(self, batch: Batch) -> Loss:
@@ -120,12 +127,11 @@ class IDQL(CriticModule):
     def act(self, observations: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Actions (B, A) for observations (B, O)."""
         h, x = self.hparams, self.normaliser(observations)
-        wide, proposed = draw(self.target_actor, x, h.samples, generator)
-        q = self.critic.least(wide, proposed).view(len(x), h.samples)
+        proposed, q = proposals(self.target_actor, self.critic, x, h.samples, generator)
         index = q.argmax(dim=-1)
         if h.selection == "weighted":
             index = torch.multinomial(self.weights(q, self.value(x)), 1, generator=generator).squeeze(-1)
-        return self.action_box.from_unit(take(proposed.view(len(x), h.samples, -1), index))
+        return self.action_box.from_unit(take(proposed, index))
 
     def predict_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Actions (B, A) for the states of a batch."""

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 import dds_lightning.losses as losses
-from dds_lightning.baselines.critics import Batch, Loss, TwinCritic, draw, take
+from dds_lightning.baselines.critics import Batch, Loss, TwinCritic, proposals, take
 from dds_lightning.baselines.opal import LatentModule
 from dds_lightning.nn.diffusion import DiffusionDecoder
 from dds_lightning.nn.normaliser import Normaliser
@@ -110,10 +110,9 @@ class LDCQ(LatentModule):
 
     @torch.no_grad()
     def _target(self, batch: Batch) -> Tensor:
-        count = self.hparams.backup_samples
-        wide, proposed = draw(self.prior, self.normaliser(batch["next_observations"]), count)
-        after = self.critic.least(wide, proposed).view(-1, count).amax(dim=-1)
-        return losses.td_target(batch["rewards"], batch["discounts"], batch["dones"], after)
+        states = self.normaliser(batch["next_observations"])
+        _, q = proposals(self.prior, self.critic, states, self.hparams.backup_samples)
+        return losses.td_target(batch["rewards"], batch["discounts"], batch["dones"], q.amax(dim=-1))
 
     def followers(self, step: int) -> list[tuple[nn.Module, nn.Module, float]]:
         """The target critic moves after every step."""
@@ -122,6 +121,5 @@ class LDCQ(LatentModule):
     def propose(self, states: Tensor, greedy: bool, generator: torch.Generator | None) -> Tensor:
         """The best of the prior's proposals, or one of them."""
         count = self.hparams.samples if greedy else 1
-        wide, proposed = draw(self.prior, states, count, generator)
-        index = self.critic.least(wide, proposed).view(-1, count).argmax(dim=-1)
-        return take(proposed.view(len(states), count, -1), index)
+        proposed, q = proposals(self.prior, self.critic, states, count, generator)
+        return take(proposed, q.argmax(dim=-1))

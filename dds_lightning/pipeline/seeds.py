@@ -18,7 +18,6 @@ from functools import partial
 from typing import Any
 
 import pandas as pd
-from scipy.stats import trim_mean
 
 from dds_lightning.console.interrupts import Interrupted
 from dds_lightning.console.reports import Report, plain, table
@@ -30,6 +29,7 @@ from dds_lightning.pipeline.run import run_all
 from dds_lightning.pipeline.settings import RunSettings
 from dds_lightning.saving.files import written_whole
 from dds_lightning.saving.run_directory import duration, locked
+from dds_lightning.study.statistics import iqm
 from dds_lightning.study.tables import BEST, SKILL, markdown
 
 REPORT, TABLE = "seeds.md", "seeds.csv"
@@ -147,7 +147,7 @@ def over_seeds(tables: Sequence[Sequence[Mapping[str, Any]]]) -> pd.DataFrame:
             values = played[measure].astype(float).dropna()
             if len(values):
                 row |= {measure: values.mean(), f"{measure}_std": values.std(ddof=1)}
-                row[f"{measure}_iqm"] = float(trim_mean(values, 0.25))
+                row[f"{measure}_iqm"] = float(iqm(values.to_numpy()[:, None]))
         found.append({**row, "scores": played["score"].tolist()})
     return pd.DataFrame(found)
 

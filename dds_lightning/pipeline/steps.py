@@ -21,6 +21,7 @@ from dds_lightning.pipeline.context import Run, Settings
 from dds_lightning.pipeline.evaluating import evaluate, evaluation_settings, play_baselines
 from dds_lightning.study import protocol
 from dds_lightning.tasks import facts_to_keep
+from dds_lightning.training.stages import get_stage
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,7 @@ def training_step(
 
 def _fit(stage: str, best: str, publish: bool, run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
     """Run `dds STAGE fit`, from its last checkpoint if there is one."""
-    skill = run.output("skill", "checkpoint") if stage in ("policy", "online") else None
+    skill = run.output("skill", "checkpoint") if "skill" in get_stage(stage).reads else None
     last = folder / "last.ckpt"
     resume = last if resuming and last.is_file() else None
     run.say(run.trainings.command(stage, run.data_spec, skill, resume), style="dim")
