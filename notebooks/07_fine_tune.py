@@ -226,12 +226,12 @@ outcome["codes restarted"] = [
 outcome.round(2)
 
 # %% [markdown]
-# * **The decoder alone** gains what there is to gain, and the policy never notices: code 7 is still code 7.
+# * **The decoder alone** gains most of what there is to gain, and the policy never notices: code 7 is still code 7.
 # * **Encoder alone** does not change what a code *does*, so the policy plays as before, up to chance in its draws.
 # * **Restarts make it a lottery** (`codebook`, `all`), and the loss does not show it. The careful driver hardly uses
 #   some of the codes that this policy depends on. They count as dead, are restarted from the new data, and mean
-#   something else from then on. Above, `codebook` lost and `all` won: its 100 % are luck. With three other seeds of
-#   `all` the old policy reached the goal in 25, 60 and 80 % of 20 episodes.
+#   something else from then on. Above, that cost `codebook` and `all` the policy; with three other seeds of `all` it
+#   reached the goal in 25, 60 and 80 % of 20 episodes.
 # * **Without restarts** everything can learn, and the same three seeds reach it in 100, 95 and 100 %.
 # * **From scratch** the codes have nothing to do with this policy.
 #
