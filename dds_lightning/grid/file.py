@@ -57,7 +57,8 @@ OURS = (
 BUDGETS = (
     "trainer.max_steps",
     "trainer.val_check_interval",
-    "model.critic_steps",
+    "model.critic_steps",  # a critic that never stops would leave the actor no step
+    "model.freeze_codes_after",
     "model.warmup_steps",
     "stop.min_steps",
 )

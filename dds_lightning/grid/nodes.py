@@ -166,7 +166,6 @@ class _Planner:
         for name in BUDGETS:
             if isinstance(settings.get(name), int | float) and settings[name] > 0 and study.scale != 1:
                 settings[name] = given[name] = self._scaled(settings[name])
-        # A critic that never stops leaves the actor no step.
         reads = {"data": made["data"], **{name: made[name] for name in row.reads}}
         how: dict[str, Any] = {"config": config, "given": {k: v for k, v in given.items() if preset.get(k) != v}}
         if study.watch and stage == PLAYERS[cell.method].stages[-1] and stage in WATCHED:
