@@ -1,0 +1,137 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # 11 · Does K matter on my data? From a question to a table with intervals
+#
+# **What you will see:** a question as a file of ten lines, a grid of trainings that all cores work on, a table with
+# intervals instead of one lucky number, and what the table does not say.
+#
+# **Time:** about five minutes on two CPU cores. No network, no GPU, no graphics driver.
+#
+# A score of one training is an anecdote: with another seed the same settings may do much better or worse. Whoever
+# wants to know whether a setting matters trains every value of it with several seeds, and looks at the intervals.
+
+# %%
+# %matplotlib inline
+from pathlib import Path
+
+import pandas as pd
+from IPython.display import Markdown, display
+
+from dds_lightning.cli import main
+from dds_lightning.grid import figures
+from dds_lightning.grid.results import Results
+from dds_lightning.study.statistics import interval
+
+# %% tags=["parameters"] quick={"DATA_STEPS": 2000, "SKILL_STEPS": 4, "POLICY_STEPS": 4, "EPISODES": 1, "SEEDS": [0, 1]}
+DATA_STEPS = 20_000
+SKILL_STEPS = 400
+POLICY_STEPS = 1_500
+EPISODES = 20
+SEEDS = [0, 1, 2]
+RUNS = Path("../runs/notebooks/11")  # what this notebook writes lies here
+
+# %% [markdown]
+# ## The question as a file
+#
+# `tasks`, `seeds` and `grid` span the cells. Settings are those of `dds skill fit` and `dds policy fit` with the
+# stage in front, so everything that can be set can be asked about. Everything that is not named is the preset's. The
+# budgets here are tiny, so that the answer comes within minutes; for your own data add `data: local:FOLDER`.
+
+# %%
+RUNS.mkdir(parents=True, exist_ok=True)
+study_file = RUNS / "does_k_matter.yaml"
+study_file.write_text(
+    f"""
+title: Does the number of skills matter?
+tasks: [pointmaze-umaze-diverse]
+seeds: {SEEDS}
+settings:
+  data.steps: {DATA_STEPS}
+  skill.model.hidden_dim: 64
+  skill.trainer.max_steps: {SKILL_STEPS}
+  policy.trainer.max_steps: {POLICY_STEPS}
+  evaluate.episodes: {EPISODES}
+grid:
+  skill.model.num_skills: [4, 16]
+labels: {{skill.model.num_skills: K}}
+"""
+)
+main(["study", "run", str(study_file), "--out", str(RUNS), "--plan"])
+# %% [markdown]
+# The plan shows what is shared: one data set serves all cells. A piece of work is named by the hash of its settings
+# and of what it reads; whatever two cells have in common is done once, also across study files in the same folder.
+#
+# ## Run it
+#
+# On a terminal this is `dds study run does_k_matter.yaml`. Stop it at any time: what is finished is kept, and a
+# training goes on from its last checkpoint. On a cluster, add `--engine ray` or `--engine slurm`.
+
+# %%
+status = main(["study", "run", str(study_file), "--out", str(RUNS)])
+
+# %% [markdown]
+# The same command again finds everything done:
+
+# %%
+again = main(["study", "run", str(study_file), "--out", str(RUNS)])
+
+# %% [markdown]
+# ## The table, with intervals
+#
+# The first table is what papers print: mean ± standard deviation over seeds. The second holds the interquartile mean
+# (the mean of the middle half, which one lucky or unlucky seed does not move much) with its 95 % interval, and the
+# probability that a training with the second K beats one with the first.
+
+# %%
+results = Results.read(RUNS / study_file.stem)
+table, comparison = results.table(), results.comparison()
+display(table.style.hide(axis="index"))
+display(comparison.round(2).style.hide(axis="index"))
+display(figures.plot_intervals(comparison))
+
+# %% [markdown]
+# **How to read it.** If the intervals overlap, this study cannot tell the two apart: that is not the same as "K does
+# not matter". Look at the probability, too: 0.5 is a coin, and its interval says how sure that is.
+#
+# ## Would more seeds help?
+#
+# An interval shrinks with the number of seeds, roughly with its square root. Drawing seeds from those that we have
+# shows how wide it would be with more of them, if they scattered as these do.
+
+# %%
+first = next(iter(results.groups().values()))
+widths = []
+for count in (3, 5, 10, 20):
+    more = pd.concat([first] * -(-count // len(first))).to_numpy()[:count]
+    found = interval(more)
+    widths.append({"seeds": count, "width of the interval": round(found.high - found.low, 1)})
+display(pd.DataFrame(widths).style.hide(axis="index"))
+
+# %% [markdown]
+# ## The page to keep
+#
+# `dds study report` wrote one page with tables, figures, times, versions and the command behind every number, and the
+# same as Markdown. Its beginning:
+
+# %%
+page = RUNS / study_file.stem / "report" / "report.md"
+display(Markdown("\n".join(page.read_text().split("## Is it real?")[0].splitlines()[:14]).replace("# ", "#### ")))
+
+# %% tags=["check"]
+assert (status, again) == (0, 0)
+assert list(results.cells["state"]) == ["done"] * 2 * len(SEEDS)
+assert list(table.columns) == ["task", "K 4", "K 16"]
+assert (comparison["low"] <= comparison["IQM"]).all()
+assert (comparison["IQM"] <= comparison["high"]).all()
+assert page.with_name("index.html").stat().st_size > 20_000
