@@ -28,8 +28,8 @@ zero."""
 class SegmentDataModule(pl.LightningDataModule):
     """Sliding windows over offline episodes, as batches `{"observations": (B, H, O), "actions": (B, H, A)}`.
 
-    Values are in raw units; the model normalises with `statistics()`. Windows never cross an episode. Training and
-    validation share no episode.
+    Beside them `"starts"` (B,) says in which row of the data's actions each segment starts. Values are in raw units;
+    the model normalises with `statistics()`. Windows never cross an episode. Training and validation share no episode.
 
     For your own arrays: `SegmentDataModule.from_trajectories(Trajectories.from_episodes("mine", episodes))`;
     the docstring of `datamodules.trajectories` shows the form of `episodes`.
@@ -217,6 +217,7 @@ class SegmentDataModule(pl.LightningDataModule):
             return {
                 "observations": observations[first_rows[index, None] + span],  # (B, H, O)
                 "actions": actions[first_steps[index, None] + span],  # (B, H, A)
+                "starts": first_steps[index],
             }
 
         return TensorLoader(gather, len(segments), self.batch_size, device=device, **options)

@@ -24,6 +24,7 @@ from dds_lightning.nn.diffusion import DiffusionDecoder, MLPDecoder, Sampler
 from dds_lightning.nn.encoder import ENCODERS
 from dds_lightning.nn.gaussian import GaussianBottleneck
 from dds_lightning.nn.normaliser import ActionBox, Normaliser
+from dds_lightning.nn.settled import SettledCodes
 from dds_lightning.nn.usage import CodebookUsage
 
 START_BATCHES = 64
@@ -36,8 +37,9 @@ class SkillModule(StageModule):
     """Learn K discrete skills from segments of H steps.
 
     A training batch is ``{"observations": (B, H, O), "actions": (B, H, A)}`` in the environment's own units;
-    normalisation is part of the module. The defaults are the paper's (tables 4, 5 and 6), save ``codebook_init`` and
-    ``restart_threshold``, whose paper-like values are ``uniform`` and 0.
+    normalisation is part of the module. With ``"starts"`` (B,), the row of the data where each segment starts, segments
+    are encoded only once after their codes have stopped changing. The defaults are the paper's (tables 4, 5 and 6),
+    save ``codebook_init`` and ``restart_threshold``, whose paper-like values are ``uniform`` and 0.
 
     Args:
         observation_dim: O, linked from the data on the command line.
@@ -152,15 +154,8 @@ class SkillModule(StageModule):
         self.horizon, self.num_skills, self.discrete = horizon, num_skills, space.discrete
         self.normaliser = Normaliser(observation_dim)
         self.action_box = ActionBox(action_dim)
-        self.encoder = ENCODERS[encoder](
-            observation_dim + action_dim,
-            space.widths * skill_dim,
-            horizon,
-            hidden_dim,
-            encoder_layers,
-            encoder_heads,
-            dropout,
-        )
+        depth = (horizon, hidden_dim, encoder_layers, encoder_heads, dropout)
+        self.encoder = ENCODERS[encoder](observation_dim + action_dim, space.widths * skill_dim, *depth)
         self.bottleneck = space.build(self.hparams)
         backbone = (observation_dim, action_dim, skill_dim, hidden_dim, decoder_blocks, dropout)
         self.decoder: DiffusionDecoder | MLPDecoder = (
@@ -170,6 +165,7 @@ class SkillModule(StageModule):
         )
         self.reconstruction_rmse = MeanMetric()
         self.usage = CodebookUsage(num_skills)
+        self._settled = SettledCodes()
         self._batch: Batch = {}  # of the step in progress: dead codes restart from it
         self._begin(init_from)
 
@@ -195,21 +191,25 @@ class SkillModule(StageModule):
             The scalar to minimise, its detached terms by name (not weighted), and the skills of the batch.
         """
         observations, actions = batch["observations"], batch["actions"]  # (B, H, O), (B, H, A)
-        horizon = actions.shape[1]
-        skill = self.encode_segments(observations, actions)
+        skill = self._settled.skills(self, batch) or self.encode_segments(observations, actions)
         error = self.decoder.loss(
             self.action_box.to_unit(actions).flatten(0, 1),  # (B H, A)
             self.normaliser(observations).flatten(0, 1),  # (B H, O)
-            skill.vectors.repeat_interleave(horizon, dim=0),  # (B H, D)
+            skill.vectors.repeat_interleave(actions.shape[1], dim=0),  # (B H, D)
         )
         total = error.mean()
         if self.hparams.reconstruction == "sum":
-            total = total * (horizon * actions.shape[-1])
+            total = total * actions[0].numel()
         terms = {"denoising": total.detach()}
         for name, term in skill.terms.items():
             total = total + term.weight * term.value
             terms[name] = term.value.detach()
         return total, terms, skill
+
+    def configure_callbacks(self) -> list[SettledCodes]:
+        """Give each training a memory of its own for codes that stand still."""
+        self._settled = SettledCodes()
+        return [self._settled]
 
     def encode(self, observations: Tensor, actions: Tensor, lengths: Tensor | None = None) -> Tensor:
         """Code of each segment, k = argmin ||E(tau) - z_j||: shapes as in `encode_segments`, result (B,) int64.

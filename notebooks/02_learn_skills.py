@@ -111,7 +111,7 @@ data = load_trajectories(f"local:{folder}", task)
 segments = SegmentDataModule.from_trajectories(data, horizon=HORIZON, batch_size=128, validation_fraction=0.1)
 segments.setup()
 batch = next(iter(segments.train_dataloader()))
-print({name: tuple(tensor.shape) for name, tensor in batch.items()})
+print({name: tuple(batch[name].shape) for name in ("observations", "actions")})
 
 # %% [markdown]
 # ## Learn, and watch

@@ -30,30 +30,68 @@ class AverageWeights(WeightAveraging):
         if decay is not None and not 0.0 < decay < 1.0:
             raise UserError(f"average.decay is {decay}, expected null or a number in (0, 1)")
         self.decay = decay
-        self._copied: tuple[str, ...] = ()  # parts whose average is what they are
-        super().__init__(use_buffers=False, multi_avg_fn=self._average)
+        self._copied: tuple[str, ...] | None = None  # parts whose average is what they are
+        self._pairs: tuple[list[Tensor], list[Tensor]] = ([], [])  # averages, and the weights that they follow
+        super().__init__(use_buffers=False)
 
-    def _average(self, averages: list[Tensor], weights: list[Tensor], count: Tensor | int) -> None:
-        """Move the averages towards the weights after `count` updates."""
-        assert self.decay is not None, "without a decay the callback is left out"
-        keep = min(self.decay, (1.0 + float(count)) / (10.0 + float(count)))
-        torch._foreach_lerp_(averages, weights, 1.0 - keep)
+    def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
+        """Copy the module when a fit begins."""
+        super().setup(trainer, pl_module, stage)
+        self._copied = None
 
     def on_train_batch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *args: Any, **kwargs: Any) -> None:
-        """Move the averages, and take the parts as they are that have just stopped learning."""
-        super().on_train_batch_end(trainer, pl_module, *args, **kwargs)
-        frozen = getattr(pl_module, "frozen_modules", ())
-        if frozen != self._copied and self._average_model is not None:
-            self._copied = frozen
-            averaged: Any = self._average_model.module
-            for name in frozen:
-                getattr(averaged, name).load_state_dict(getattr(pl_module, name).state_dict())
+        """Move the averages, and take the parts as they are that have just stopped learning.
+
+        `AveragedModel.update_parameters` would collect all weights of both models again in every step, which takes
+        longer than averaging them.
+        """
+        if trainer.global_step <= self._latest_update_step:
+            return  # gradients are being accumulated
+        self._latest_update_step = trainer.global_step
+        copy: Any = self._average_model
+        assert self.decay is not None, "without a decay the callback is left out"
+        frozen = tuple(getattr(pl_module, "frozen_modules", ()))
+        if frozen != self._copied:
+            self._follow(copy.module, pl_module, frozen)
+        count = int(copy.n_averaged)
+        keep = min(self.decay, (1.0 + count) / (10.0 + count)) if count else 0.0
+        torch._foreach_lerp_(*self._pairs, 1.0 - keep)
+        copy.n_averaged += 1
+
+    def _follow(self, averaged: Any, pl_module: pl.LightningModule, frozen: tuple[str, ...]) -> None:
+        """Take frozen parts as they are, and let the averages of all others follow their weights."""
+        for name in frozen:
+            getattr(averaged, name).load_state_dict(getattr(pl_module, name).state_dict())
+        weights = dict(pl_module.named_parameters())
+        learning = [name for name in weights if name.partition(".")[0] not in frozen]
+        followers = dict(averaged.named_parameters())
+        self._pairs = ([followers[name].detach() for name in learning], [weights[name].detach() for name in learning])
+        self._copied = frozen
+
+    def _share_buffers(self, pl_module: pl.LightningModule) -> None:
+        """Give the copy the buffers as they are now, before anyone sees it."""
+        if self._average_model is not None:
+            for theirs, ours in zip(self._average_model.module.buffers(), pl_module.buffers(), strict=True):
+                theirs.copy_(ours)
+
+    def on_validation_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Validate the average."""
+        self._share_buffers(pl_module)
+        super().on_validation_epoch_start(trainer, pl_module)
+
+    def on_save_checkpoint(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Save the average as the module's state, and both sets of weights."""
+        self._share_buffers(pl_module)
+        super().on_save_checkpoint(trainer, pl_module, checkpoint)
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Keep the weights apart: what is saved now must go on exactly, should it be trained longer."""
 
     def on_fit_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Leave the module with the averaged weights."""
+        self._share_buffers(pl_module)
         self._copy_average_to_current(pl_module)
 
     def on_load_checkpoint(

@@ -150,8 +150,10 @@ def test_batches_are_segments_of_one_episode(data: Trajectories) -> None:
     assert {key: tuple(value.shape) for key, value in batch.items()} == {
         "observations": (8, 4, 2),
         "actions": (8, 4, 1),
+        "starts": (8,),
     }
-    assert {value.dtype for value in batch.values()} == {torch.float32}
+    assert [value.dtype for value in batch.values()] == [torch.float32, torch.float32, torch.int64]
+    assert torch.equal(torch.from_numpy(data.actions)[batch["starts"]], batch["actions"][:, 0])
     everything = _batches(module.predict_dataloader())
     observations, actions = everything["observations"], everything["actions"]
     assert len(observations) == sum(12 + e % 3 - 3 for e in range(20))
