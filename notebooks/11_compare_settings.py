@@ -11,7 +11,7 @@
 # ---
 
 # %% [markdown]
-# # 11 · Does K matter on my data? From a question to a table with intervals
+# # 11 · Does K matter on my data?
 #
 # **What you will see:** a question as a file of ten lines, a grid of trainings that all cores work on, a table with
 # intervals instead of one lucky number, and what the table does not say.
@@ -97,7 +97,7 @@ again = main(["study", "run", str(study_file), "--out", str(RUNS)])
 results = Results.read(RUNS / study_file.stem)
 table, comparison = results.table(), results.comparison()
 display(table.style.hide(axis="index"))
-display(comparison.round(2).style.hide(axis="index"))
+display(comparison.style.hide(axis="index").format(precision=2, na_rep="–"))
 display(figures.plot_intervals(comparison))
 
 # %% [markdown]
@@ -116,7 +116,7 @@ for count in (3, 5, 10, 20):
     more = pd.concat([first] * -(-count // len(first))).to_numpy()[:count]
     found = interval(more)
     widths.append({"seeds": count, "width of the interval": round(found.high - found.low, 1)})
-display(pd.DataFrame(widths).style.hide(axis="index"))
+display(pd.DataFrame(widths).style.hide(axis="index").format(precision=1))
 
 # %% [markdown]
 # ## The page to keep
@@ -135,3 +135,28 @@ assert list(table.columns) == ["task", "K 4", "K 16"]
 assert (comparison["low"] <= comparison["IQM"]).all()
 assert (comparison["IQM"] <= comparison["high"]).all()
 assert page.with_name("index.html").stat().st_size > 20_000
+
+# %% [markdown]
+# ## Exercises
+#
+# 1. What would the study do again if you set `evaluate.episodes: 50`? Guess, then ask with `--plan`.
+# 2. Add a line `variants: {noiseless: {evaluate.noise_scale: 0}}`: does the decoder's noise matter? How many trainings
+#    does the answer cost?
+# 3. Which question would you need other data for?
+#
+# <details>
+# <summary>Answers</summary>
+#
+# 1. The six evaluations and nothing else: no training reads how many episodes will be played.
+# 2. None. The grid has twelve cells then, but the noise belongs to acting, so what is new are six evaluations.
+# 3. Whether more data help, or data of another driver (where data are collected, `data.steps` and `data.seed` are
+#    settings, too). And every question about your own robot: the best K of a maze is not that of a leg.
+#
+# </details>
+#
+# ## The same at full size
+#
+# ```bash
+# dds study run table2 --plan        # the paper's table 2 on PointMaze-Large: K and D, three seeds
+# dds study run table2 --workers 2   # about four minutes of one core for each of its 48 cells
+# ```

@@ -73,6 +73,7 @@ def plot_intervals(comparison: pd.DataFrame) -> Figure:
     axes.hlines(places, rows["low"], rows["high"], linewidth=5, alpha=0.4)
     axes.plot(rows["IQM"], places, "k|", markersize=9)
     axes.set_yticks(places, rows["setting"], fontsize=8)
+    axes.set_ylim(-0.6, len(rows) - 0.4)
     return figure
 
 
