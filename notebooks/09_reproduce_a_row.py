@@ -151,9 +151,9 @@ plot_strobes(task, frames, every=13, title="one second of a medium episode (0) a
 # levels off. This notebook uses a fraction of it, at higher learning rates, with one layer less in the encoder and
 # narrower networks in the policy. (Below, a dash stands for the default of the module: two hidden layers of 256.)
 #
-# **When is it done?** After `freeze_codes_after` steps encoder and codebook stand still and the decoder learns on alone,
-# at less than half the cost of a step. From `stop.min_steps` on, a line through the later half of the held-out loss, over
-# the steps, both logarithmic, says by how much a quarter more steps would lower it; once that is less than
+# **When is it done?** After `freeze_codes_after` steps encoder and codebook stand still and the decoder learns on
+# alone, at less than half the cost of a step. From `stop.min_steps` on, a line through the later half of the held-out
+# loss, over the steps, both logarithmic, says by how much a quarter more steps would lower it; once that is less than
 # `stop.tolerance`, the skills are done. (The preset asks for 3 %, this notebook is content with 6.)
 #
 # A recipe this small is close to failing, so two things are deliberately different: 32 skills instead of 16, and
