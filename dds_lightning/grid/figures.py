@@ -14,6 +14,8 @@ from dds_lightning.study.statistics import performance_profile
 
 MOST = 12
 """Curves that one can still tell apart."""
+COLOURS = 10
+"""Curves before matplotlib's colours begin again."""
 
 
 def _axes(x: str, y: str, size: tuple[float, float] = (6.4, 3.6)) -> tuple[Figure, Any]:
@@ -82,8 +84,9 @@ def plot_profiles(groups: Mapping[str, pd.DataFrame]) -> Figure:
     figure, axes = _axes("normalised score", "share of runs above")
     top = max(100.0, *(float(scores.to_numpy().max()) for scores in groups.values()))
     thresholds = np.linspace(0.0, top, 201)
-    for name, scores in list(groups.items())[:MOST]:
-        axes.plot(thresholds, performance_profile(scores, thresholds), label=name, drawstyle="steps-post")
+    for index, (name, scores) in enumerate(list(groups.items())[:MOST]):
+        style = "-" if index < COLOURS else "--"
+        axes.plot(thresholds, performance_profile(scores, thresholds), style, label=name, drawstyle="steps-post")
     axes.legend(frameon=False, fontsize=7)
     return figure
 

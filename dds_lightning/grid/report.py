@@ -143,6 +143,7 @@ def _making(results: Results) -> list[Section]:
         for one in results.made
     ]
     shown = results.cells[["title", "state", "score", "best", "chosen", "seconds"]].copy()
+    shown = shown if shown["chosen"].any() else shown.drop(columns="chosen")
     shown["seconds"] = shown["seconds"].map(duration)
     shown = shown.rename(columns={"title": "cell", "seconds": "time, with all it reads"}).round(1)
     shown = shown.dropna(axis=1, how="all")
