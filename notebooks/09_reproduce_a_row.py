@@ -17,7 +17,7 @@
 # collected on the spot and inspected, all stages of the method with a reduced recipe, the evaluation in the real
 # simulator, and, scored in the same way, the full-size shipped agent next to the paper's number.
 #
-# **Time:** about seven minutes on two CPU cores. No network, no GPU, no graphics driver.
+# **Time:** four to five minutes on two CPU cores. No network, no GPU, no graphics driver.
 #
 # A number is reproduced when somebody else gets it by doing the same. So first: what is "the same"? Four things affect
 # a score before any learning does, and three of them differ here. We point them out as they come up.
@@ -373,8 +373,8 @@ checks.round(1)
 # 1. A recipe this small is close to failing, so expect tens of points: see the two trials above. And no, it is not the
 #    same: the ± in the table is the standard error over episodes of *one* agent; the deviation over seeds also contains
 #    what a training makes of its luck, and it is usually larger.
-# 2. Look at the diagnosis, not only at the score. 8,000 steps of 64 segments are 6.4 passes over 80,000 steps, but only
-#    1.3 over 400,000: if error of decoded actions and agreement with the data do not improve, the training was the
+# 2. Look at the diagnosis, not only at the score. 4,500 steps of 64 segments are 3.6 passes over 80,000 steps, but only
+#    0.7 over 400,000: if error of decoded actions and agreement with the data do not improve, the training was the
 #    bottleneck, and more data alone cannot help.
 # 3. Expect little. Where the data hold one gait there is no better half to choose: `argmax` and imitation meet, and
 #    what remains is a preference for the better moments of the same gait.
