@@ -167,7 +167,7 @@ RECIPE = {
     "skill.model.num_skills": 32,
     "skill.model.encoder_layers": 1,
     "skill.model.lr": 1e-3,
-    "skill.model.freeze_codes_after": SKILL_STEPS // 5,
+    "skill.model.freeze_codes_after": max(SKILL_STEPS // 5, 1),
     "skill.stop.min_steps": SKILL_STEPS // 2,
     "skill.stop.tolerance": 0.06,
     "policy.trainer.max_steps": POLICY_STEPS,

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from dds_lightning.console.reports import Report, pairs, table
 from dds_lightning.errors import UserError
+from dds_lightning.saving.places import refuse_no_folder
 
 
 def publish(
@@ -33,6 +34,7 @@ def publish(
         card: A text file for README.md; without it the run's card.
         public: Make a new repository on the Hub public.
     """
+    refuse_no_folder(run)
     from dds_lightning.agent import DDSAgent
     from dds_lightning.saving.hub import is_hub, push
     from dds_lightning.saving.published import CARD, load_published
@@ -133,6 +135,7 @@ def export(
         temperature: Sampling temperature; without it the agent's.
         noise_scale: Factor on the decoder's noise; without it the agent's.
     """
+    refuse_no_folder(directory)
     from dds_lightning.agent import DDSAgent
     from dds_lightning.saving.hub import is_hub, pull
     from dds_lightning.saving.published import load_published

@@ -10,6 +10,7 @@ from datamodules.relabelling import Relabelling
 from dds_lightning.cli.arguments import data_spec
 from dds_lightning.console.reports import Report, pairs, table
 from dds_lightning.errors import UserError
+from dds_lightning.saving.places import refuse_no_folder
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -80,10 +81,13 @@ def run(
             seed-N of `out`; the table has mean, standard deviation and interquartile mean over the seeds.
         **stages: Settings for `dds STAGE fit` of each training stage, see above.
     """
+    from dds_lightning.configs import run_defaults
+    from dds_lightning.tasks import get_task
+
+    run_defaults(preset or get_task(task).family)  # what is misspelt is told before anything heavy is imported
     from dds_lightning.pipeline.run import run_all
     from dds_lightning.pipeline.seeds import run_seeds
     from dds_lightning.pipeline.settings import RunSettings
-    from dds_lightning.tasks import get_task
 
     settings = RunSettings.with_preset(
         task=task,
@@ -185,6 +189,7 @@ def evaluate(
         workers: Number of processes for the environments; without it one per core.
         out: Parquet file for the table of episodes.
     """
+    refuse_no_folder(directory)
     from dds_lightning.cli.methods import baseline_at, evaluate_baseline
     from dds_lightning.study.evaluate import evaluate as play
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from dds_lightning.console.reports import Report
+from dds_lightning.saving.places import refuse_no_folder
 
 
 def record(
@@ -35,6 +36,7 @@ def record(
         noise_scale: Factor on the decoder's noise; without it the agent's.
         seed: Seed of the environments and of the agent.
     """
+    refuse_no_folder(agent)
     from dds_lightning.saving.hub import is_hub, pull
     from dds_lightning.study.record import record as make
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from dds_lightning.errors import UserError
 from dds_lightning.rollout.actors import Contestant, single_skills
+from dds_lightning.saving.places import refuse_no_folder
 from dds_lightning.study.loose import advice
 from dds_lightning.tasks import Task
 
@@ -115,8 +116,7 @@ def agent_directory(directory: Path) -> Path:
     Raises:
         UserError: The directory is neither.
     """
-    if not directory.is_dir():
-        raise UserError(f"there is no folder {directory}: give a run of `dds run` or a published checkpoint")
+    refuse_no_folder(directory)
     for candidate in (directory / "agent", directory):
         if (candidate / "model.safetensors").is_file():
             return candidate

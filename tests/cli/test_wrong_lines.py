@@ -173,6 +173,12 @@ TYPOS = [
     ["skill", "fit", "--model.encoder=transfomer"],
     ["run", TASK, "--policy.trianer.max_steps=3"],
     ["policy", "fti"],
+    ["run", TASK, "--preset=pointmase"],
+    ["run", "pointmaze-larg-diverse"],
+    *(
+        [command, "checkpoints/pointmaz-large", *more]
+        for command, more in {"evaluate": [], "record": [], "export": [], "publish": ["shared/there"]}.items()
+    ),
 ]
 
 
