@@ -84,8 +84,8 @@ ROOMS = {
     "datamodules.relabelling datamodules.relabel datamodules.sources",
     "dds_lightning.grid": "agent baselines configs console envs errors online rollout saving study tasks training "
     "datamodules.collect datamodules.relabelled datamodules.relabelling datamodules.sources",
-    "dds_lightning.cli": "_version agent baselines console errors grid interpret.draw online pipeline policy rollout "
-    "saving sharing skill study tasks training datamodules.collect datamodules.inspection datamodules.listing "
+    "dds_lightning.cli": "_version agent baselines configs console errors grid interpret.draw online pipeline policy "
+    "rollout saving sharing skill study tasks training datamodules.collect datamodules.inspection datamodules.listing "
     "datamodules.physics datamodules.relabel datamodules.relabelled datamodules.relabelling datamodules.sources",
     "dds_lightning.__main__": "cli",
 }

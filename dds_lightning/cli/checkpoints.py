@@ -34,7 +34,8 @@ def publish(
         card: A text file for README.md; without it the run's card.
         public: Make a new repository on the Hub public.
     """
-    refuse_no_folder(run)
+    if skill is None and policy is None:
+        refuse_no_folder(run)
     from dds_lightning.agent import DDSAgent
     from dds_lightning.saving.hub import is_hub, push
     from dds_lightning.saving.published import CARD, load_published
