@@ -154,8 +154,8 @@ class SkillModule(StageModule):
         self.horizon, self.num_skills, self.discrete = horizon, num_skills, space.discrete
         self.normaliser = Normaliser(observation_dim)
         self.action_box = ActionBox(action_dim)
-        depth = (horizon, hidden_dim, encoder_layers, encoder_heads, dropout)
-        self.encoder = ENCODERS[encoder](observation_dim + action_dim, space.widths * skill_dim, *depth)
+        shape = (horizon, hidden_dim, encoder_layers, encoder_heads, dropout)
+        self.encoder = ENCODERS[encoder](observation_dim + action_dim, space.widths * skill_dim, *shape)
         self.bottleneck = space.build(self.hparams)
         backbone = (observation_dim, action_dim, skill_dim, hidden_dim, decoder_blocks, dropout)
         self.decoder: DiffusionDecoder | MLPDecoder = (

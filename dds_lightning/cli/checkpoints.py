@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from dds_lightning.console.reports import Report, pairs, table
 from dds_lightning.errors import UserError
-from dds_lightning.saving.places import refuse_no_folder
+from dds_lightning.saving.places import is_hub, refuse_no_folder
 
 
 def publish(
@@ -34,10 +34,10 @@ def publish(
         card: A text file for README.md; without it the run's card.
         public: Make a new repository on the Hub public.
     """
-    if skill is None and policy is None:
+    if run != "-" and skill is None and policy is None:
         refuse_no_folder(run)
     from dds_lightning.agent import DDSAgent
-    from dds_lightning.saving.hub import is_hub, push
+    from dds_lightning.saving.hub import push
     from dds_lightning.saving.published import CARD, load_published
     from dds_lightning.saving.untrusted import read_text
     from dds_lightning.sharing.verify import verify_published
@@ -107,7 +107,7 @@ def verify(directory: str) -> Report:
     Args:
         directory: A published directory, or hf:OWNER/NAME.
     """
-    from dds_lightning.saving.hub import is_hub, pull
+    from dds_lightning.saving.hub import pull
     from dds_lightning.sharing.verify import verify_published
 
     facts = verify_published(pull(directory) if is_hub(directory) else directory)
@@ -136,9 +136,10 @@ def export(
         temperature: Sampling temperature; without it the agent's.
         noise_scale: Factor on the decoder's noise; without it the agent's.
     """
-    refuse_no_folder(directory)
+    if not is_hub(directory):
+        refuse_no_folder(directory)
     from dds_lightning.agent import DDSAgent
-    from dds_lightning.saving.hub import is_hub, pull
+    from dds_lightning.saving.hub import pull
     from dds_lightning.saving.published import load_published
     from dds_lightning.sharing.export import SUFFIXES, check_exported, describe, export_agent
     from dds_lightning.study.contestants import agent_directory

@@ -189,8 +189,8 @@ def evaluate(
         workers: Number of processes for the environments; without it one per core.
         out: Parquet file for the table of episodes.
     """
-    if skill is None and policy is None:
-        refuse_no_folder(directory)
+    if directory not in (None, "-") and skill is None and policy is None:
+        refuse_no_folder(str(directory))
     from dds_lightning.cli.methods import baseline_at, evaluate_baseline
     from dds_lightning.study.evaluate import evaluate as play
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from dds_lightning.console.reports import Report
-from dds_lightning.saving.places import refuse_no_folder
+from dds_lightning.saving.places import is_hub, refuse_no_folder
 
 
 def record(
@@ -36,8 +36,9 @@ def record(
         noise_scale: Factor on the decoder's noise; without it the agent's.
         seed: Seed of the environments and of the agent.
     """
-    refuse_no_folder(agent)
-    from dds_lightning.saving.hub import is_hub, pull
+    if not is_hub(agent):
+        refuse_no_folder(agent)
+    from dds_lightning.saving.hub import pull
     from dds_lightning.study.record import record as make
 
     place = pull(agent) if is_hub(agent) else Path(agent)

@@ -10,14 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from dds_lightning.errors import UserError, lacks_extra
+from dds_lightning.saving.places import is_hub as is_hub
 from dds_lightning.saving.published import CONTENTS, SUMS, load_published
-
-PREFIX = "hf:"
-
-
-def is_hub(place: str | Path) -> bool:
-    """Whether an address is on the Hub."""
-    return str(place).startswith(PREFIX)
 
 
 def pull(place: str, token: str | None = None) -> Path:
