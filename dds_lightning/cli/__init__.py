@@ -65,7 +65,8 @@ def _dispatch(arguments: list[str]) -> int:
         return 0
     try:
         if arguments and arguments[0] in STAGES and arguments[1:2] != ["compare"]:
-            from dds_lightning.training.options import help_of, refuse_typos
+            from dds_lightning.training.options import help_of
+            from dds_lightning.training.typos import refuse_typos
 
             if (text := help_of(arguments[0], arguments[1:])) is not None:
                 print(text, end="")

@@ -171,7 +171,7 @@ def refuse_settings(settings: Mapping[str, Any]) -> None:
         refuse_seed("--seed", settings["seed"])
     for stage in run_stages():
         if settings.get(stage):
-            from dds_lightning.training.options import refuse_typos
+            from dds_lightning.training.typos import refuse_typos
 
             refuse_typos(stage, ["fit", *settings[stage]], prefix=f"{stage}.")
 

@@ -31,8 +31,9 @@ from dds_lightning.console.refusals import did_you_mean
 from dds_lightning.errors import UserError, refuse_seed
 from dds_lightning.saving.untrusted import read_yaml
 from dds_lightning.tasks import get_task
-from dds_lightning.training.options import options, refuse_typos
+from dds_lightning.training.options import options
 from dds_lightning.training.stages import STAGES
+from dds_lightning.training.typos import refuse_typos
 
 ONLINE = Method(
     "online", "DDS, online", "Discrete diffusion skills, section 5.3", ("skill", "online"), METHODS["dds"].actor

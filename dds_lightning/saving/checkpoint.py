@@ -23,7 +23,8 @@ from torch import nn
 from dds_lightning.errors import UserError, reason
 from dds_lightning.saving.arrays import check_archive
 from dds_lightning.saving.build import build_module
-from dds_lightning.saving.files import neighbours, refuse_newer, written_whole
+from dds_lightning.saving.files import refuse_newer, written_whole
+from dds_lightning.saving.places import refuse_no_checkpoint
 from dds_lightning.saving.published import Published as Published
 from dds_lightning.saving.published import load_published
 from dds_lightning.saving.published import publish as publish
@@ -138,8 +139,7 @@ def load_ckpt(path: str | os.PathLike[str]) -> dict[str, Any]:
             values.
     """
     path = Path(path)
-    if not path.exists():
-        raise UserError(f"there is no checkpoint {path}{neighbours(path)}")
+    refuse_no_checkpoint(path)
     size = regular_file(path)
     try:
         _check_parts(path, size)

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from dds_lightning.errors import UserError
+from dds_lightning.saving.files import neighbours
 
 PREFIX = "hf:"
 
@@ -20,3 +21,13 @@ def refuse_no_folder(agent: str | Path) -> None:
     """
     if not Path(agent).is_dir():
         raise UserError(f"there is no folder {agent}: give a run of `dds run` or a published checkpoint")
+
+
+def refuse_no_checkpoint(path: Path, setting: str = "") -> None:
+    """Refuse a checkpoint that does not exist.
+
+    Raises:
+        UserError: There is no such file; `setting` begins the sentence.
+    """
+    if not path.exists():
+        raise UserError(f"{setting}there is no checkpoint {path}{neighbours(path)}")

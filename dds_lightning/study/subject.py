@@ -15,7 +15,7 @@ from dds_lightning.interpret.atlas.pictures import Announce
 from dds_lightning.rollout.actors import single_skills
 from dds_lightning.rollout.play import rollout
 from dds_lightning.rollout.result import RolloutResult
-from dds_lightning.saving.files import neighbours
+from dds_lightning.saving.places import refuse_no_checkpoint
 from dds_lightning.saving.run_directory import MARKER, read_marker
 from dds_lightning.saving.untrusted import conform
 from dds_lightning.skill import SkillModule
@@ -82,8 +82,7 @@ def find_subject(place: Path, seed: int = 0, asked: str | None = None) -> Subjec
 
 
 def _skills_alone(checkpoint: Path, seed: int) -> DDSAgent:
-    if not checkpoint.is_file():
-        raise UserError(f"there is no checkpoint {checkpoint}{neighbours(checkpoint)}")
+    refuse_no_checkpoint(checkpoint)
     return DDSAgent(SkillModule.load(checkpoint), None, "random", seed=seed)
 
 

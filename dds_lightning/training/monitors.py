@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterable, Iterator
+from typing import Any, NoReturn
 
 from jsonargparse import Namespace
 
-from dds_lightning.callbacks.rollouts import RolloutEvaluation
 from dds_lightning.console.refusals import did_you_mean
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import get_task
@@ -40,11 +39,20 @@ def refuse_unlogged(stage: Stage, settings: Namespace) -> None:
         if metric.startswith("rollout/") and not any(name.startswith("rollout/") for name in logged):
             remedy = "which only a RolloutEvaluation logs: add --trainer.callbacks+=dds_lightning.callbacks."
             raise UserError(f"{setting} is {metric}, {remedy}RolloutEvaluation")
-        hint = did_you_mean(metric.replace("_", "/", 1), logged) or did_you_mean(metric, logged)
-        raise UserError(
-            f"{setting} is {metric}, which the {stage.name} training never logs, expected one of "
-            f"{', '.join(logged)}{hint}"
-        )
+        refuse_metric(stage, setting, metric, logged)
+
+
+def refuse_metric(stage: Stage, setting: str, metric: str, logged: Iterable[str]) -> NoReturn:
+    """Refuse one metric.
+
+    Raises:
+        UserError: Names the setting, the metric and those that are logged.
+    """
+    logged = sorted(logged)
+    hint = did_you_mean(metric.replace("_", "/", 1), logged) or did_you_mean(metric, logged)
+    raise UserError(
+        f"{setting} is {metric}, which the {stage.name} training never logs, expected one of {', '.join(logged)}{hint}"
+    )
 
 
 def refuse_late_validation(settings: Namespace, steps: int) -> None:
@@ -86,6 +94,8 @@ def _watched(settings: Namespace, callbacks: list[Namespace]) -> Iterator[tuple[
 
 
 def _logged(stage: Stage, settings: Namespace, callbacks: list[Namespace]) -> set[str]:
+    from dds_lightning.callbacks.rollouts import RolloutEvaluation
+
     names = set(stage.metrics)
     if settings.trainer.limit_val_batches == 0 or settings.data.get("validation_fraction") == 0:
         names = {name for name in names if not name.startswith("val/")}

@@ -1,23 +1,13 @@
-"""The options of `dds STAGE` as its sources say them: the help, and the answer to a typo, without importing torch.
-
-`stage_cli` parses in earnest; what is refused here would be refused there, several seconds later.
-"""
+"""The options of `dds STAGE` as its sources say them, and its help, without importing torch."""
 
 from __future__ import annotations
 
 import argparse
 import inspect
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
-from jsonargparse import ArgumentError, ArgumentParser
-
-from dds_lightning.configs import resolve_configs
-from dds_lightning.console.arguments import takes_lists
-from dds_lightning.console.refusals import did_you_mean, sentence
-from dds_lightning.errors import UserError
-from dds_lightning.saving.untrusted import read_yaml
 from dds_lightning.training.source import Parameter, parameters_of, summary_of
 from dds_lightning.training.stages import Stage, get_stage
 
@@ -83,9 +73,6 @@ def options(stage: Stage) -> dict[str, Parameter]:
     return {f"{group.name}.{key}".lstrip("."): one for group in groups(stage) for key, one in group.parameters.items()}
 
 
-# ---------------------------------------------------------------------- help
-
-
 def help_of(name: str, arguments: Sequence[str]) -> str | None:
     """The help that the arguments after `dds STAGE` ask for; None where they ask for none, or for a class's."""
     if arguments and not {"-h", "--help"} & set(arguments):
@@ -131,88 +118,3 @@ def _described(key: str, one: Parameter) -> dict[str, Any]:
 def _plain(value: Any) -> Any:
     """As a person types it."""
     return str(value).lower() if isinstance(value, bool) else list(value) if isinstance(value, tuple) else value
-
-
-# ---------------------------------------------------------------------- typos
-
-
-def refuse_typos(name: str, arguments: Sequence[str], prefix: str = "") -> None:
-    """Refuse options that the stage does not have, and values that do not fit their types.
-
-    Args:
-        name: Of the stage.
-        arguments: What follows `dds STAGE`.
-        prefix: What another command writes before these options.
-
-    Raises:
-        UserError: Names the first, what was expected, and where the help is.
-    """
-    stage = get_stage(name)
-    subcommand = next((one for one in arguments if not one.startswith("-")), "")
-    if subcommand not in SUBCOMMANDS:
-        near = did_you_mean(subcommand, SUBCOMMANDS)
-        raise UserError(f"dds {name} {subcommand}: there is no such command, expected {', '.join(SUBCOMMANDS)}{near}")
-    known = options(stage)
-    unread = tuple(group.name for group in groups(stage) if not group.parameters)
-    for option, value in _given(resolve_configs(arguments)):
-        found = _known(option.rstrip("+"), known)
-        help_ = "--help trainer" if option.startswith("trainer.") else "--help"
-        where = f"(see `dds {name} {subcommand} {help_}`)"
-        if found is None and option.partition(".")[0] not in unread:
-            near = did_you_mean(f"--{prefix}{option}", [f"--{prefix}{one}" for one in known])
-            raise UserError(f"--{prefix}{option} is not an option of `dds {name} {subcommand}`{near} {where}")
-        if value is not None and found == option and found in known:
-            _refuse_value(found, value, known[found], where)
-
-
-def _given(arguments: Sequence[str]) -> Iterator[tuple[str, str | None]]:
-    """Options and their values, on the command line and in files; a value of None is not looked at."""
-    words = iter(arguments)
-    for word in words:
-        if word in ("-c", "--config"):
-            yield from _of_file(next(words, ""))
-        elif word.startswith("--config="):
-            yield from _of_file(word.partition("=")[2])
-        elif word.startswith("--"):
-            option, equals, value = word[2:].partition("=")
-            if not equals and option.partition(".")[0] not in FLAGS and not option.endswith(".help"):
-                value = next(words, "")
-                if value.startswith("--"):  # no value at all: the parser says what is missing
-                    words = iter([value, *words])
-                    value = ""
-            yield option, value or None
-
-
-def _of_file(path: str) -> Iterator[tuple[str, None]]:
-    try:
-        settings = read_yaml(path)
-    except UserError:
-        return  # the parser says what is wrong with it
-    for group, inner in settings.items() if isinstance(settings, dict) else ():
-        if isinstance(inner, dict):
-            yield from ((f"{group}.{key}", None) for key in inner)
-        else:
-            yield str(group), None
-
-
-def _known(option: str, known: dict[str, Parameter]) -> str | None:
-    """The option that is meant: itself, a beginning of one, a group, or a setting inside one; None if there is none."""
-    if option in known:
-        return option
-    if option.partition(".")[0] in (*FLAGS, *METHODS) or option.endswith(".help"):
-        return option
-    inside = next((name for name in known if option.startswith(f"{name}.")), None)
-    return inside or next((name for name in known if name.startswith(option)), None)
-
-
-def _refuse_value(option: str, value: str, one: Parameter, where: str) -> None:
-    if one.annotation is inspect.Parameter.empty:
-        return
-    if takes_lists(one.annotation) and not value.lstrip().startswith("["):
-        value = f"[{value}]"
-    parser = ArgumentParser(exit_on_error=False)
-    parser.add_argument(f"--{option}", type=one.annotation)
-    try:
-        parser.parse_args([f"--{option}={value}"])
-    except ArgumentError as error:
-        raise UserError(f"{sentence(error.message)} {where}") from None

@@ -51,6 +51,14 @@ def summary_of(address: str) -> str:
     return (ast.get_docstring(node) or "").partition("\n")[0] if node else ""
 
 
+def classes_in(package: str) -> dict[str, str]:
+    """The classes that a package offers: name -> address as "package.file:Class"."""
+    file = _file(package)
+    offered = file.assigned.get("__all__")
+    names = ast.literal_eval(offered) if offered is not None else (*file.imports, *file.classes)
+    return {name: address for name in names if name[0].isupper() and (address := file.address_of(name))}
+
+
 def _parameters(file: _File, node: ast.ClassDef, method: str) -> dict[str, Parameter]:
     texts = _texts(node)
     function = next((one for one in node.body if isinstance(one, ast.FunctionDef) and one.name == method), None)

@@ -5,7 +5,6 @@ differ.
 """
 
 import os
-from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -24,26 +23,14 @@ from dds_lightning.callbacks.rolling import RollingCheckpoint
 from dds_lightning.errors import UserError
 from dds_lightning.saving.checkpoint import SETTINGS_KEY, AtomicCheckpointIO
 from dds_lightning.training.progress import StepProgress
+from dds_lightning.training.rules import refuse_values
 
 QUIET_LOGGERS = ("CSVLogger", "TensorBoardLogger", "WandbLogger", "MLFlowLogger")
 """Loggers that start nothing before the first value."""
 CLUSTERS = ("MASTER_ADDR", "SLURM_NTASKS", "LSB_JOBID", "OMPI_COMM_WORLD_SIZE")
 """Variables by which Lightning finds the other nodes."""
-HALF = ("16-true", "bf16-true", "transformer-engine", "transformer-engine-float16")
 THREADS = "threads"
 """Entry of a checkpoint's settings, and the setting of the command line."""
-RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
-    ("val_check_interval", lambda value: value != 0, "a number of batches, a share of an epoch, or a time"),
-    ("check_val_every_n_epoch", lambda value: value >= 1, "at least 1, or null to count batches across epochs"),
-    ("accumulate_grad_batches", lambda value: value >= 1, "at least 1"),
-    ("limit_train_batches", lambda value: value != 0, "more: nothing would be trained"),
-    ("log_every_n_steps", lambda value: value >= 0, "at least 0"),
-    ("precision", lambda value: value not in HALF, "bf16-mixed or 16-mixed: distances to codes need 32-bit weights"),
-    ("gradient_clip_val", lambda value: value >= 0, "at least 0, or null: a negative one turns gradients round"),
-    ("num_sanity_val_steps", lambda value: value >= -1, "at least 0, or -1 for all"),
-    ("num_nodes", lambda value: value >= 1, "at least 1"),
-)
-"""Settings of the Trainer that fail in the middle of a training, or with which nothing happens, without a word."""
 
 
 class TrainingSettings(Callback):
@@ -104,12 +91,10 @@ def trainer_settings(config: dict[str, Any], extra: list[Callback]) -> dict[str,
         The keyword arguments to build the Trainer with.
 
     Raises:
-        UserError: A value of `RULES`.
+        UserError: A value that breaks one of the `rules`.
     """
     config = dict(config)
-    for name, allowed, expected in RULES:
-        if config.get(name) is not None and not allowed(config[name]):
-            raise UserError(f"trainer.{name} is {config[name]}, expected {expected}")
+    refuse_values(config)
     if (config.get("num_nodes") or 1) > 1 and not any(name in os.environ for name in CLUSTERS):
         raise UserError(
             f"trainer.num_nodes is {config['num_nodes']}, but nothing says where the others are, and Lightning would "

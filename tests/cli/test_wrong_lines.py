@@ -14,12 +14,12 @@ from tests.fits import QUIET, SKILL, TASK, of_data, told
 
 LINES = [
     # what Lightning refuses
-    ("S --trainer.accelerator=gpuu", "accelerator='gpuu'"),
+    ("S --trainer.accelerator=gpuu", "trainer.accelerator is gpuu, which does not exist: did you mean"),
     ("S --trainer.accelerator=tpu", "torch_xla"),
-    ("S --trainer.strategy=dpp", "strategy='dpp'"),
+    ("S --trainer.strategy=dpp", "trainer.strategy is dpp, which does not exist: did you mean"),
     ("S --trainer.devices=0", "devices"),
     ("S --trainer.devices=many", "--trainer.devices=many"),
-    ("S --trainer.profiler=simpel", "'simple'"),
+    ("S --trainer.profiler=simpel", "did you mean simple?"),
     ("S --trainer.logger=WandbLogger", "pip install -e '.[log]'"),
     ("S --trainer.logger=WandbLoger", "did you mean WandbLogger?"),
     ("S --trainer.logger=CSVLogger", "CSVLogger needs save_dir: give --trainer.logger.save_dir=VALUE"),
@@ -171,6 +171,25 @@ def test_slurm_variables_that_do_not_fit_are_one_sentence(dds, data, monkeypatch
 TYPOS = [
     ["skill", "fit", "--model.lrr=1"],
     ["skill", "fit", "--model.encoder=transfomer"],
+    ["skill", "fit", "--data.task=pointmaze-larg-diverse"],
+    ["skill", "fit", "--ckpt_path=runs/skil/last.ckpt"],
+    ["skill", "fit", "--seed_everything=-1"],
+    ["skill", "fit", "--best.monitor=val/los"],
+    *(
+        ["skill", "fit", *(f"--trainer.{one}" for one in line.split())]
+        for line in (
+            "strategy=dpp",
+            "accelerator=gpuu",
+            "profiler=simpel",
+            "logger=WandbLoger",
+            "callbacks+=EarlyStoping",
+            "callbacks+=EarlyStopping callbacks.moniter=val/loss",
+            "callbacks+=EarlyStopping callbacks.monitor=val/los",
+            "precision=16-mixd",
+            "num_nodes=0",
+        )
+    ),
+    ["run", TASK, "--policy.trainer.strategy=dpp"],
     ["run", TASK, "--policy.trianer.max_steps=3"],
     ["policy", "fti"],
     ["run", TASK, "--preset=pointmase"],

@@ -2,10 +2,10 @@
 
 import pytest
 
-from dds_lightning.training.options import FLAGS, GENERAL, METHODS, help_of, options, refuse_typos
+from dds_lightning.training.options import FLAGS, GENERAL, METHODS, help_of, options
 from dds_lightning.training.source import parameters_of
 from dds_lightning.training.stage_cli import StageCLI
-from dds_lightning.training.stages import STAGES, preset_configs
+from dds_lightning.training.stages import STAGES
 
 
 @pytest.mark.parametrize("stage", STAGES)
@@ -24,11 +24,6 @@ def test_the_defaults_are_those_of_the_parser(stage):
     for name, one in options(STAGES[stage]).items():
         if name.startswith("model.") and isinstance(one.default, int | float | str):
             assert real[name] == one.default, name
-
-
-def test_packaged_configurations_hold_no_typo():
-    for name, config in preset_configs("pointmaze").items():
-        refuse_typos(name, ["fit", *(["--config", str(config)] if config else [])])
 
 
 def test_keywords_that_are_passed_on_are_found_in_the_class_that_takes_them():
