@@ -128,6 +128,7 @@ class OnlineDataModule(pl.LightningDataModule):
         if self.skill is not None:
             self.choices = int(self.skill.hparams["num_skills" if self.skill.discrete else "skill_dim"])
         self.skill_hash = None if self.skill is None else self.skill.fingerprint()
+        self.skill_settings = None if self.skill is None else dict(self.skill.hparams)
         self.prior_unknown = prior_rewards == "unknown"
         self.horizon = 1 if self.skill is None else self.skill.horizon
         self.prior: Relabelled | None = None
@@ -238,6 +239,10 @@ class OnlineLoader:
     def _collect_what_is_due(self) -> None:
         """Collect until the environment steps so far allow one more update."""
         h = self.data.hparams
+        if (follower := self._module().follower) is not None:
+            self.replay.keep_steps(self.data.horizon, self.data.task.action_dim)
+            for env in self.collector.envs:
+                env.skill = follower.skill
         while self.collector.steps < h.random_steps or self.updates + 1 > self._allowed():
             self.collector.collect(self.replay, self._choose)
 
@@ -271,7 +276,7 @@ class OnlineLoader:
         if prior is not None and count:
             past = prior.batch(torch.randint(len(prior), (count,), generator=self.generator))
             past["actions"] = past.pop("codes")
-            batch = {name: torch.cat([column, past[name]]) for name, column in batch.items()}
+            batch |= {name: torch.cat([batch[name], column]) for name, column in past.items()}
         if self.data.prior_unknown:
             batch["known"] = torch.arange(h.batch_size) < h.batch_size - count
         return batch

@@ -107,7 +107,7 @@ class DDSAgent(nn.Module):
                 if (mine := getattr(self, name)) != (other := theirs[name]):
                     told = f"{name} is {mine} in the skill model and {other} in the policy"
                     raise UserError(f"{told}: they do not belong together")
-            learnt_with = self.policy.hparams.get("skill_hash")
+            learnt_with = getattr(self.policy, "skill_hash", None)
             if learnt_with and learnt_with != (found := self.skill.fingerprint()):
                 raise UserError(
                     f"the policy was trained on the codes of skill model {short(learnt_with)}, this one is "

@@ -84,6 +84,12 @@ class StageModule(pl.LightningModule):
         return [trainable] if isinstance(trainable, str) else list(trainable)
 
     @property
+    def skill_hash(self) -> str | None:
+        """Fingerprint of the skill model whose codes it chooses; None if it is unknown, or it chooses none."""
+        known: str | None = self.hparams.get("skill_hash")
+        return known
+
+    @property
     def frozen_modules(self) -> tuple[str, ...]:
         """Names of the submodules that do not learn; a Gaussian bottleneck has no weights and keeps drawing."""
         names = (name for part in self.PARTS if part not in self.trained_parts for name in self.PARTS[part])

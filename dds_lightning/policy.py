@@ -28,6 +28,7 @@ from torch import Tensor, nn
 
 import dds_lightning.losses as losses
 from dds_lightning.module import StageModule
+from dds_lightning.nn.draws import categorical
 from dds_lightning.nn.mlp import MLP, FourierFeatures
 from dds_lightning.nn.normaliser import Normaliser
 from dds_lightning.nn.watch import complaints
@@ -218,8 +219,7 @@ class PolicyModule(StageModule):
         logits = self.logits(observations)
         if selection == "greedy":
             return logits.argmax(dim=-1)
-        probabilities = (logits / temperature).softmax(dim=-1)
-        return torch.multinomial(probabilities, 1, generator=generator).squeeze(-1)
+        return categorical((logits / temperature).softmax(dim=-1), generator)
 
     @property
     def inverse_temperature(self) -> Tensor | float:

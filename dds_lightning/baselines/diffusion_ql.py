@@ -20,6 +20,7 @@ from torch import Tensor, nn
 import dds_lightning.losses as losses
 from dds_lightning.baselines.critics import Batch, CriticModule, Loss, TwinCritic, draw, proposals, take, with_target
 from dds_lightning.nn.diffusion import DiffusionDecoder
+from dds_lightning.nn.draws import categorical
 from dds_lightning.nn.normaliser import ActionBox, Normaliser
 
 
@@ -127,7 +128,7 @@ class DiffusionQL(CriticModule):
         """Actions (B, A) for observations (B, O)."""
         x = self.normaliser(observations)
         proposed, q = proposals(self.actor, self.critic, x, self.hparams.samples, generator)
-        index = torch.multinomial(q.softmax(dim=-1), 1, generator=generator).squeeze(-1)
+        index = categorical(q.softmax(dim=-1), generator)
         return self.action_box.from_unit(take(proposed, index))
 
     def predict_step(self, batch: Batch, batch_idx: int) -> Tensor:

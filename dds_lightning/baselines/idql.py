@@ -29,6 +29,7 @@ from dds_lightning.baselines.critics import (
     with_target,
 )
 from dds_lightning.nn.diffusion import DiffusionDecoder
+from dds_lightning.nn.draws import categorical
 from dds_lightning.nn.mlp import MLP
 from dds_lightning.nn.normaliser import ActionBox, Normaliser
 
@@ -130,7 +131,7 @@ class IDQL(CriticModule):
         proposed, q = proposals(self.target_actor, self.critic, x, h.samples, generator)
         index = q.argmax(dim=-1)
         if h.selection == "weighted":
-            index = torch.multinomial(self.weights(q, self.value(x)), 1, generator=generator).squeeze(-1)
+            index = categorical(self.weights(q, self.value(x)), generator)
         return self.action_box.from_unit(take(proposed, index))
 
     def predict_step(self, batch: Batch, batch_idx: int) -> Tensor:

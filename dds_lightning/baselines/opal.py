@@ -21,6 +21,7 @@ from torch import Tensor, nn
 import dds_lightning.losses as losses
 from dds_lightning.baselines.critics import Batch, CriticModule, Loss, TwinCritic, implicit
 from dds_lightning.errors import UserError
+from dds_lightning.nn.draws import normal
 from dds_lightning.nn.mlp import MLP
 from dds_lightning.nn.normaliser import Normaliser
 
@@ -159,5 +160,5 @@ class OPAL(LatentModule):
         policy = self.policy(states)
         if greedy:
             return policy.mean
-        noise = torch.randn(policy.mean.shape, generator=generator, device=states.device)
+        noise = normal(policy.mean.shape, states.device, generator)
         return policy.mean + policy.stddev * noise

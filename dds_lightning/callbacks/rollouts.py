@@ -181,6 +181,8 @@ class RolloutEvaluation(Callback):
     def _skill_model(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> Any:
         if isinstance(pl_module, SACModule) and pl_module.hparams.space == "raw":
             return RawActions(pl_module)
+        if isinstance(pl_module, SACModule) and pl_module.follower is not None:
+            return pl_module.follower.skill
         if self._skill is None:
             if self.skill_path is not None:
                 self._skill = SkillModule.load(self.skill_path)

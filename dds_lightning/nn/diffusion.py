@@ -6,6 +6,8 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from dds_lightning.nn.draws import normal
+
 Sampler = Literal["ddpm", "ddim"]
 
 
@@ -162,7 +164,7 @@ class DiffusionDecoder(nn.Module):
             (B, A), in [-1, 1] when ``clip`` is set.
         """
         size = (len(observations), self.action_dim)
-        drawn = [torch.randn(size, device=observations.device, generator=generator) for _ in range(self.draws)]
+        drawn = [normal(size, observations.device, generator) for _ in range(self.draws)]
         return self.denoise(noise_scale * torch.stack(drawn), observations, skills)
 
     @property

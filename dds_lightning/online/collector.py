@@ -59,15 +59,21 @@ class Collector:
         chosen = choose(before, self.generator)
         for env, action in zip(self.envs, chosen, strict=True):
             env.begin(action)
-        while playing := [env for env in self.envs if not env.over]:
+        seen: list[list[Any]] = [[] for _ in self.envs]  # (h, O) what was seen in each step
+        done: list[list[Any]] = [[] for _ in self.envs]  # (h, A) what was done in it
+        while numbers := [number for number, env in enumerate(self.envs) if not env.over]:
+            playing = [self.envs[number] for number in numbers]
             skill = playing[0].skill
             acts = decode(skill, playing, self.generator) if skill else [env.chosen for env in playing]
-            for env, primitive in zip(playing, acts, strict=True):
+            for number, env, primitive in zip(numbers, playing, acts, strict=True):
+                seen[number].append(env.observation)
+                done[number].append(primitive)
                 env.advance(primitive)
         for number, (env, observation, action) in enumerate(zip(self.envs, before, chosen, strict=True)):
             after, reward, terminated, truncated, info = env.finish()
             facts = {"discounts": info["discount"], "dones": float(terminated), "rewards": reward}
-            replay.add(observations=observation, actions=action, next_observations=after, **facts)
+            steps = {"step_observations": seen[number], "step_actions": done[number], "steps": len(done[number])}
+            replay.add(observations=observation, actions=action, next_observations=after, **facts, **steps)
             self._note(number, info)
             if terminated or truncated:
                 self.finished.append((self.returns[number], float(self.success[number]), float(self.steps)))

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
+from dds_lightning.nn.draws import normal
 from dds_lightning.nn.mlp import MLP
 
 Selection = Literal["sample", "greedy"]
@@ -101,7 +102,7 @@ class BoxHead(nn.Module):
         stays finite at the walls of the cube.
         """
         mean, std = self.moments(features)
-        noise = torch.randn(mean.shape, generator=generator, device=mean.device)
+        noise = normal(mean.shape, mean.device, generator)
         u = mean + std * noise
         log_normal = -0.5 * noise.square() - std.log() - 0.5 * math.log(2 * math.pi)
         log_slope = 2.0 * (math.log(2.0) - u - softplus(-2.0 * u))

@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -43,8 +43,14 @@ class Novelty(nn.Module):
         """Squared error of the prediction: (B, I) to (B,)."""
         return (self.predictor(x) - self.random(x)).square().mean(dim=-1)
 
-    def loss(self, x: Tensor, rewards: Tensor, dones: Tensor) -> Tensor:
-        """Loss of all three on collected transitions: (B, I), (B,) and (B,) to a scalar."""
+    def loss(self, batch: Mapping[str, Tensor], x: Tensor) -> Tensor:
+        """Loss of all three on the transitions that were collected here.
+
+        Args:
+            batch: ``known`` (B,) says which; ``rewards`` and ``dones`` (B,).
+            x: (B, I) states and choices.
+        """
+        x, rewards, dones = (column[batch["known"]] for column in (x, batch["rewards"], batch["dones"]))
         error = self.error(x).mean()
         if self.training and not bool(self.first):
             self.first.copy_(error.detach())
@@ -52,11 +58,12 @@ class Novelty(nn.Module):
         return error + mse_loss(reward, rewards) + binary_cross_entropy_with_logits(end, dones)
 
     @torch.no_grad()
-    def label(self, x: Tensor, optimism: float) -> tuple[Tensor, Tensor]:
-        """Optimistic rewards and terminations: (B, I) to (B,) each.
+    def label(self, batch: Mapping[str, Tensor], x: Tensor, optimism: float) -> tuple[Tensor, Tensor]:
+        """Rewards and terminations (B,), optimistic ones where the data do not say them; arguments as of `loss`.
 
         The novelty is in units of the error at the beginning: 1 where nothing was learnt, 0 where everything was.
         """
         reward, end = self.outcome(x).unbind(dim=-1)
-        novelty = self.error(x) / self.first.clamp_min(1e-12)
-        return reward + optimism * novelty, (end > 0).float()
+        bright = reward + optimism * self.error(x) / self.first.clamp_min(1e-12)
+        known = batch["known"]
+        return torch.where(known, batch["rewards"], bright), torch.where(known, batch["dones"], (end > 0).float())

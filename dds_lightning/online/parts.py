@@ -84,6 +84,8 @@ def checkpoint_parts(
     if policy is not None:
         online = "online" in load_published(policy).config if Path(policy).is_dir() else _stage(policy) == "online"
         chooser = (SACModule if online else PolicyModule).load(policy)
+    if isinstance(chooser, SACModule) and chooser.follower is not None:
+        return chooser.follower.skill, chooser  # as its decoder is now
     if skill is not None:
         return SkillModule.load(skill), chooser
     if not isinstance(chooser, SACModule) or chooser.hparams.space != "raw":

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -34,21 +35,44 @@ class Replay:
             "dones": torch.empty(size),
         }
 
+    def keep_steps(self, horizon: int, action_dim: int) -> None:
+        """From now on keep the steps of every transition too: what was seen and done in each.
+
+        Args:
+            horizon: H steps at most.
+            action_dim: A numbers of a primitive action.
+        """
+        if "steps" in self.columns:
+            return
+        width = self.columns["observations"].shape[1]
+        self.columns |= {
+            "steps": torch.empty(self.size, dtype=torch.int64),  # taken, H or fewer
+            "step_observations": torch.empty(self.size, horizon, width),
+            "step_actions": torch.empty(self.size, horizon, action_dim),
+        }
+
     def __len__(self) -> int:
         """Rows with a transition."""
         return self.count
 
     def add(self, **row: Any) -> None:
-        """Write one transition, a value for each column."""
+        """Write one transition, a value for each column; of its steps as many as were taken."""
         for name, column in self.columns.items():
-            column[self.next] = torch.as_tensor(row[name])
+            if name.startswith("step_"):
+                column[self.next, : row["steps"]] = torch.from_numpy(np.asarray(row[name], np.float32))
+            else:
+                column[self.next] = torch.as_tensor(row[name])
         self.next = (self.next + 1) % self.size
         self.count = min(self.count + 1, self.size)
 
     def sample(self, count: int, generator: torch.Generator) -> dict[str, Tensor]:
-        """Draw rows with replacement."""
+        """Draw rows with replacement; of the steps of each, where they are kept, one: (count, O) and (count, A)."""
         index = torch.randint(self.count, (count,), generator=generator)
-        return {name: column[index] for name, column in self.columns.items()}
+        batch = {name: column[index] for name, column in self.columns.items() if "step" not in name}
+        if "steps" in self.columns:
+            step = (torch.rand(count, generator=generator) * self.columns["steps"][index]).long()
+            batch |= {name: self.columns[name][index, step] for name in ("step_observations", "step_actions")}
+        return batch
 
     def state_dict(self) -> dict[str, Any]:
         """The rows that were written, and where the next goes."""
@@ -65,7 +89,14 @@ class Replay:
             raise UserError(
                 f"data.replay_size is {self.size}, the checkpoint's replay has {state['size']}: give the same"
             )
+        if "step_actions" in state["rows"]:
+            self.keep_steps(*state["rows"]["step_actions"].shape[1:])
         for name, column in self.columns.items():
+            if name not in state["rows"]:
+                raise UserError(
+                    "model.follow is above 0, but the checkpoint's replay has no steps to learn from: go on with 0, or "
+                    "start a new training"
+                )
             found = state["rows"][name]
             if found.shape[1:] != column.shape[1:] or found.dtype != column.dtype:
                 raise UserError(

@@ -26,9 +26,11 @@ from torch.nn.functional import one_hot
 
 import dds_lightning.losses as losses
 from dds_lightning.errors import UserError
-from dds_lightning.module import StageModule
+from dds_lightning.module import StageModule, adam
+from dds_lightning.nn.draws import categorical
 from dds_lightning.nn.mlp import MLP, FourierFeatures
 from dds_lightning.nn.normaliser import ActionBox, Normaliser
+from dds_lightning.online.follower import Follower
 from dds_lightning.online.heads import BoxHead, CodeHead
 from dds_lightning.online.novelty import Novelty
 from dds_lightning.online.offline import start_offline
@@ -69,9 +71,12 @@ class SACModule(StageModule):
         offline: ``.ckpt`` or published directory of an offline policy (`dds policy fit`) over the same codes: its
             policy and its critics are where this training starts. One in closed form is taught to the actor in the
             states of the prior data.
+        follow: Learning rate of the skills' decoder; 0 lets the skills stand still. Above, the decoder repeats what
+            went better than the critics expected (`dds_lightning.online.follower`).
         optimism: Weight of the novelty in the rewards of prior data whose rewards are not known, in learning rewards.
         prior_unknown: Whether there are such data, linked from the data.
         skill_hash: Fingerprint of the skill model whose skills these are, linked from the data; null for raw actions.
+        skill_settings: Settings of that model, linked from the data; kept where its decoder learns.
 
     Raises:
         UserError: A setting is outside its range; the message names it.
@@ -109,11 +114,14 @@ class SACModule(StageModule):
         init_from: str | None = None,
         offline: str | None = None,
         optimism: float = 1.0,
+        follow: float = 0.0,
         prior_unknown: bool = False,
         skill_hash: str | None = None,
+        skill_settings: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
         hidden_dims = list(hidden_dims)
+        with_skills, skill_settings = skill_settings is not None, skill_settings if follow else None
         self.save_hyperparameters(ignore=["init_from", "offline"])
         discrete = space == "discrete"
         entropy = target_entropy is None or not discrete or 0 <= target_entropy <= 1
@@ -126,6 +134,8 @@ class SACModule(StageModule):
             ("target_ema", 0 < target_ema <= 1, "in (0, 1]"),
             ("actor_start", actor_start >= 0, "0 or more"),
             ("optimism", optimism >= 0, "0 or more"),
+            ("follow", follow >= 0, "0 or more"),
+            ("follow", with_skills or not follow, "0: there are no skills whose decoder could learn"),
         ]
         self._refuse(rules)
         self.num_skills = choices if discrete else 0
@@ -142,6 +152,7 @@ class SACModule(StageModule):
         self.target_critic.load_state_dict(self.critic.state_dict())
         self.target_critic.requires_grad_(False)
         self.novelty = Novelty(width + choices, hidden_dims) if prior_unknown else None
+        self.follower = Follower(skill_settings, follow) if skill_settings else None
         self.log_alpha = nn.Parameter(torch.tensor(math.log(temperature)), requires_grad=target_entropy is not None)
         aim = (target_entropy or 0.0) * (math.log(choices) if discrete else -choices)
         self.register_buffer("target_entropy", torch.tensor(aim))
@@ -156,6 +167,11 @@ class SACModule(StageModule):
     def starts_offline(self) -> bool:
         """Whether the policy knows something before the first update, so that it need not begin at random."""
         return self._offline is not None or self.init_from is not None
+
+    @property
+    def skill_hash(self) -> str | None:
+        """Fingerprint of the skill model whose skills it chooses, as their decoder is now."""
+        return super().skill_hash if self.follower is None else self.follower.skill.fingerprint()
 
     @property
     def discrete(self) -> bool:
@@ -192,7 +208,7 @@ class SACModule(StageModule):
             scores = self.q(observations) if selection == "argmax_q" else self.logits(observations)
             return scores.masked_fill(~self.support_mask, -torch.inf).argmax(dim=-1)
         probabilities = (self.logits(observations) / temperature).softmax(dim=-1)
-        return torch.multinomial(probabilities, 1, generator=generator).squeeze(-1)
+        return categorical(probabilities, generator)
 
     def choose(
         self,
@@ -257,7 +273,9 @@ class SACModule(StageModule):
             after = self.embed(batch["next_observations"])
             follow = self.actor.expect(after, self.support_mask, self._judge_target)
             next_v = follow.q - (self.alpha * follow.log_pi if self.hparams.backup_entropy else 0.0)
-            rewards, dones = self._labelled(batch, features)
+            rewards, dones = batch["rewards"], batch["dones"]
+            if self.novelty is not None:
+                rewards, dones = self.novelty.label(batch, self._transition(batch, features), self.hparams.optimism)
             target = losses.td_target(rewards, batch["discounts"], dones, next_v)
         taken = features
         if not self.discrete:
@@ -266,9 +284,7 @@ class SACModule(StageModule):
         q = self.actor.of_taken(values, batch["actions"])  # (N, B)
         terms = {"q_loss": losses.td(q, target)}
         if self.novelty is not None:
-            own = batch["known"]
-            facts = (batch[name][own] for name in ("rewards", "dones"))
-            terms["novelty_loss"] = self.novelty.loss(self._transition(batch, features.detach())[own], *facts)
+            terms["novelty_loss"] = self.novelty.loss(batch, self._transition(batch, features.detach()))
         learns = self.global_step >= self.hparams.actor_start
         with torch.set_grad_enabled(learns and torch.is_grad_enabled()):
             # Over codes the values of all choices are there already; over numbers the policy makes a new choice.
@@ -276,29 +292,24 @@ class SACModule(StageModule):
             now = self.actor.expect(features, self.support_mask, judge)
             terms["actor_loss"] = (self.alpha.detach() * now.log_pi - now.q).mean()
             terms["temperature_loss"] = -(self.alpha * (now.log_pi.detach() + self.target_entropy)).mean()
+        if self.follower is not None and learns and "step_actions" in batch:
+            terms["decoder_loss"] = self.follower.loss(batch, target - self._agree(q.detach()))
         waiting = () if learns else ("actor_loss", "temperature_loss")
         total = torch.stack([term for name, term in terms.items() if name not in waiting]).sum()
-        info = {"q_mean": q.mean(), "q_min": q.min(), "q_max": q.max(), "entropy": -now.log_pi.mean()}
-        info |= {"alpha": self.alpha, **terms}
+        info = {"q_mean": q.mean(), "q_min": q.min(), "q_max": q.max(), "alpha": self.alpha, **terms}
+        info["entropy"] = -now.log_pi.mean()
         return total, {name: value.detach() for name, value in info.items()}
 
     def _transition(self, batch: dict[str, Tensor], features: Tensor) -> Tensor:
         """State and choice as one vector, (B, F + K or D)."""
-        choice = (
-            one_hot(batch["actions"], self.num_skills) if self.discrete else self.action_box.to_unit(batch["actions"])
-        )
+        taken = batch["actions"]
+        choice = one_hot(taken, self.num_skills) if self.discrete else self.action_box.to_unit(taken)
         return torch.cat([features, choice], dim=-1)
 
-    def _labelled(self, batch: dict[str, Tensor], features: Tensor) -> tuple[Tensor, Tensor]:
-        """Rewards and terminations (B,), optimistic ones where the data do not say them."""
-        rewards, dones = batch["rewards"], batch["dones"]
-        if self.novelty is None:
-            return rewards, dones
-        bright, ends = self.novelty.label(self._transition(batch, features), self.hparams.optimism)
-        return torch.where(batch["known"], rewards, bright), torch.where(batch["known"], dones, ends)
-
     def on_fit_start(self) -> None:
-        """Take the units from the data, and policy and critics from offline training."""
+        """Take the units and the skills to follow from the data, and policy and critics from offline training."""
+        if self.follower is not None:
+            self.follower.start(self.trainer.datamodule.skill)  # type: ignore[attr-defined]
         if not bool(self.normaliser.fitted):
             names = ["observation_mean", "observation_std"] + ([] if self.discrete else ["action_low", "action_high"])
             found = self.data_statistics(names, "fit it with an OnlineDataModule")
@@ -308,6 +319,12 @@ class SACModule(StageModule):
             if self._offline is not None:
                 prior = getattr(getattr(self.trainer, "datamodule", None), "prior", None)
                 start_offline(self, self._offline, None if prior is None else prior.observations)
+
+    def configure_optimizers(self) -> Any:
+        """Adam over everything that learns, the decoder at its own rate."""
+        if self.follower is None:
+            return super().configure_optimizers()
+        return adam(self.follower.groups(self), self.hparams.lr, self.hparams.lr_schedule, 0, self)
 
     def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """One optimiser step's loss."""

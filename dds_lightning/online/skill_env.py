@@ -195,10 +195,11 @@ def decode(skill: Any, envs: Sequence[SkillEnv], generator: torch.Generator) -> 
         envs: In the middle of a skill.
         generator: Of the decoder's noise.
     """
-    observations = torch.from_numpy(np.stack([env.observation for env in envs]).astype(np.float32))
-    chosen = torch.from_numpy(np.stack([env.chosen for env in envs]))
+    there = skill.device
+    observations = torch.from_numpy(np.stack([env.observation for env in envs]).astype(np.float32)).to(there)
+    chosen = torch.from_numpy(np.stack([env.chosen for env in envs])).to(there)
     skills = chosen.long() if skill.discrete else chosen.float()
-    return skill.decode(observations, skills, envs[0].noise_scale, generator).numpy()
+    return skill.decode(observations, skills, envs[0].noise_scale, generator).cpu().numpy()
 
 
 def _refuse_misfit(env: gym.Env[Any, Any], skill: SkillModule) -> None:

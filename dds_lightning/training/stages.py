@@ -143,13 +143,14 @@ STAGES: dict[str, Stage] = {
             description="Online RL with trained skills: SAC over codes, continuous skills or raw actions.",
             module="dds_lightning.online.sac:SACModule",
             data="datamodules.online:OnlineDataModule",
-            links=("observation_dim", "space", "choices", "prior_unknown", "skill_hash"),
+            links=("observation_dim", "space", "choices", "prior_unknown", "skill_hash", "skill_settings"),
             steps=100_000,
             widths="model.hidden_dims or data.replay_size",
             preset="online.yaml",
             threads=1,
             metrics=_named(
-                train="loss q_loss novelty_loss actor_loss temperature_loss q_mean q_min q_max entropy alpha",
+                train="loss q_loss novelty_loss actor_loss temperature_loss decoder_loss q_mean q_min q_max entropy "
+                "alpha",
                 online="env_steps episodes return success cells",
             ),
             reads=_SKILL,

@@ -10,6 +10,7 @@ import torch
 from datamodules.online import OnlineDataModule
 from dds_lightning.agent import DDSAgent
 from dds_lightning.errors import UserError
+from dds_lightning.online.parts import checkpoint_parts
 from dds_lightning.online.replay import Replay
 from dds_lightning.online.sac import SACModule
 from dds_lightning.skill import SkillModule
@@ -62,6 +63,27 @@ def test_a_training_that_was_stopped_goes_on_to_the_bit(dds, skills, tmp_path, s
     assert all(torch.equal(value, other_rows[name]) for name, value in rows.items())
     assert len(rows["rewards"]) == state["collector"]["decisions"]
     assert state["collector"]["steps"] >= 60 + 30 / 0.1
+
+
+def test_a_decoder_that_follows_goes_on_to_the_bit_and_acts_in_the_agent(dds, data, skills, tmp_path):
+    (spec,) = [word.partition("=")[2] for word in data if word.startswith("--data.data=")]
+    more = ["--model.follow=1e-3", f"--data.data={spec}", f"--data.cache={tmp_path / 'relabel'}"]
+    through = fit(dds, "discrete", skills, tmp_path / "through", 20, *more)
+    stopped = fit(dds, "discrete", skills, tmp_path / "stopped", 9, *more)
+    resumed = fit(dds, "discrete", skills, tmp_path / "stopped", 20, *more, f"--ckpt_path={stopped}")
+    (weights, rows, _), (other, other_rows, _) = content(through), content(resumed)
+    assert all(torch.equal(value, other[name]) for name, value in weights.items())
+    assert all(torch.equal(value, other_rows[name]) for name, value in rows.items() if "step" not in name)
+    assert (rows["steps"] >= 1).all()
+    before, module = SkillModule.load(skills["discrete"]), SACModule.load(through)
+    skill, _ = checkpoint_parts(str(skills["discrete"]), str(through))
+    assert torch.equal(skill.bottleneck.vectors, before.bottleneck.vectors)
+    assert skill.fingerprint() == module.skill_hash != before.fingerprint()
+    assert "train/decoder_loss" in (tmp_path / "through" / "logs" / "version_0" / "metrics.csv").read_text()
+    given = ["--skill", skills["discrete"], "--policy", through, "--task", TASK]
+    published = dds("publish", "-", tmp_path / "agent", *given, "--json")
+    assert published.status == 0, published.err
+    assert DDSAgent.load(tmp_path / "agent").skill.fingerprint() == module.skill_hash
 
 
 @pytest.mark.parametrize("space", ["continuous", "raw"])

@@ -15,26 +15,32 @@ def trained():
     optimizer = torch.optim.Adam([p for p in novelty.parameters() if p.requires_grad], lr=3e-3)
     for _ in range(600):
         x = torch.rand(128, 2)
-        loss = novelty.loss(x, x[:, 0], (x[:, 1] > 0.5).float())
+        batch = {"known": torch.ones(128, dtype=torch.bool), "rewards": x[:, 0], "dones": (x[:, 1] > 0.5).float()}
+        loss = novelty.loss(batch, x)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
     return novelty.eval()
 
 
+def label(novelty, x, optimism):
+    unknown = {"known": torch.zeros(len(x), dtype=torch.bool), "rewards": torch.zeros(len(x))}
+    return novelty.label({**unknown, "dones": torch.zeros(len(x))}, x, optimism)
+
+
 def test_rewards_and_terminations_are_learned(trained):
     x = torch.tensor([[0.2, 0.1], [0.8, 0.9], [0.5, 0.2], [0.3, 0.8]])
-    reward, end = trained.label(x, optimism=0.0)
+    reward, end = label(trained, x, 0.0)
     assert torch.allclose(reward, x[:, 0], atol=0.05)
     assert end.tolist() == [0, 1, 0, 1]
 
 
 def test_the_bonus_is_near_zero_where_one_was_and_large_where_not(trained):
     near, far = torch.rand(200, 2), 3.0 + torch.rand(200, 2)
-    bonus = [(trained.label(x, 1.0)[0] - trained.label(x, 0.0)[0]) for x in (near, far)]
+    bonus = [label(trained, x, 1.0)[0] - label(trained, x, 0.0)[0] for x in (near, far)]
     assert bonus[0].mean() < 0.05
     assert bonus[1].mean() > 10 * bonus[0].mean()
-    twice = trained.label(far, 2.0)[0] - trained.label(far, 0.0)[0]
+    twice = label(trained, far, 2.0)[0] - label(trained, far, 0.0)[0]
     assert torch.allclose(twice, 2 * bonus[1], rtol=1e-4)
 
 
@@ -51,7 +57,8 @@ def test_unknown_rewards_are_replaced_and_known_ones_are_not():
     module.train()
     _, terms = module.loss(batch)
     assert terms["novelty_loss"] > 0
-    rewards, dones = module._labelled(batch, module.embed(batch["observations"]))
+    x = module._transition(batch, module.embed(batch["observations"]))
+    rewards, dones = module.novelty.label(batch, x, 0.5)
     assert rewards[:3].tolist() == [9.0] * 3
     assert (rewards[3:] < 3).all()
     assert dones[:3].tolist() == [1.0] * 3
