@@ -23,6 +23,8 @@ from dds_lightning.console.interrupts import Interrupted
 from dds_lightning.console.reports import Report, plain, table
 from dds_lightning.envs.pool import available_cores
 from dds_lightning.errors import UserError, refuse_seed
+from dds_lightning.interpret.draw.bars import plot_scores
+from dds_lightning.interpret.draw.png import png_bytes
 from dds_lightning.pipeline.child import Children, tell
 from dds_lightning.pipeline.context import Run
 from dds_lightning.pipeline.run import run_all
@@ -32,7 +34,7 @@ from dds_lightning.saving.run_directory import duration, locked
 from dds_lightning.study.statistics import iqm
 from dds_lightning.study.tables import BEST, SKILL, markdown
 
-REPORT, TABLE = "seeds.md", "seeds.csv"
+REPORT, TABLE, FIGURE = "seeds.md", "seeds.csv", "seeds.png"
 
 
 def run_seeds(wanted: RunSettings, count: int) -> Report:
@@ -183,8 +185,13 @@ def _report(wanted: RunSettings, made: Sequence[Mapping[str, Any]], clock: float
     links = [_link(run) for run in made]
     with written_whole(wanted.out / TABLE) as part:
         shown.to_csv(part, index=False, lineterminator="\n")
+    drawn = found.assign(kind="contestant", score_error=found["score_std"])
+    with written_whole(wanted.out / FIGURE) as part:
+        part.write_bytes(png_bytes(plot_scores(drawn, "standard deviation, and each seed")))
+    picture = f"![Scores]({FIGURE})"
     with written_whole(wanted.out / REPORT) as part:
-        part.write_text("\n\n".join([f"# {title}", markdown(shown), "\n".join(links)]) + "\n", encoding="utf-8")
+        page = "\n\n".join([f"# {title}", picture, markdown(shown), "\n".join(links)])
+        part.write_text(page + "\n", encoding="utf-8")
     report = wanted.out / REPORT
     return Report({**data, "table": found, "report": report}, [title, table(shown), f"report: {report}", end])
 

@@ -238,6 +238,8 @@ def test_seeds_share_cores_and_data_and_leave_one_table(capsys, tmp_path, data):
     assert [run["seed"] for run in said["runs"]] == [3, 4]
     assert {row["seeds"] for row in said["table"]} == {2}
     page = (tmp_path / "runs" / "seeds.md").read_text()
+    assert "![Scores](seeds.png)" in page
+    assert (tmp_path / "runs" / "seeds.png").read_bytes().startswith(b"\x89PNG")
     for seed in (3, 4):
         folder = tmp_path / "runs" / f"seed-{seed}"
         assert f"(seed-{seed}/report/report.md)" in page

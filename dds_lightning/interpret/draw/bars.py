@@ -13,11 +13,13 @@ WRAP = 40
 """Maximum number of letters of a contestant's name on one line."""
 
 
-def plot_scores(summary: pd.DataFrame) -> Figure:
-    """Draw the normalised score of every contestant and of every single skill, with its standard error.
+def plot_scores(summary: pd.DataFrame, error: str = "standard error") -> Figure:
+    """Draw the normalised score of every contestant and of every single skill, with its error.
 
     Args:
-        summary: Columns `contestant`, `kind` ("skill" for a single skill's row), `score`, `score_error`.
+        summary: Columns `contestant`, `kind` ("skill" for a single skill's row), `score`, `score_error`; with `scores`, a
+            list in each row, every one of them is a point.
+        error: What `score_error` is.
     """
     rows = summary.iloc[::-1]  # bars are drawn from the bottom
     names = [textwrap.fill(str(name), WRAP) for name in rows["contestant"]]
@@ -28,10 +30,15 @@ def plot_scores(summary: pd.DataFrame) -> Figure:
     ax = figure.add_subplot()
     errors = rows["score_error"].fillna(0.0)
     ax.barh(places, rows["score"], xerr=errors, color=colours, height=0.7, ecolor="black", capsize=2)
-    for place, score, error in zip(places, rows["score"], errors, strict=True):
+    ends = rows["score"] + errors
+    if "scores" in rows:
+        for place, scores in zip(places, rows["scores"], strict=True):
+            ax.plot(scores, np.full(len(scores), place), "o", markersize=3, color="black", alpha=0.6)
+        ends = np.maximum(ends, [max(scores) for scores in rows["scores"]])
+    for place, score, end in zip(places, rows["score"], ends, strict=True):
         ax.annotate(
             f"{score:.1f}",
-            (max(score + error, 0.0), place),
+            (max(end, 0.0), place),
             xytext=(4, 0),
             textcoords="offset points",
             va="center",
@@ -42,6 +49,6 @@ def plot_scores(summary: pd.DataFrame) -> Figure:
     ax.set_ylim(0.0, lines.sum())
     ax.margins(x=0.1)
     ax.tick_params(axis="x", labelsize=TICKS)
-    ax.set_xlabel("normalised score, ± standard error", fontsize=LABEL)
+    ax.set_xlabel(f"normalised score, ± {error}", fontsize=LABEL)
     ax.spines[["top", "right"]].set_visible(False)
     return figure
