@@ -17,8 +17,8 @@ def plot_scores(summary: pd.DataFrame, error: str = "standard error") -> Figure:
     """Draw the normalised score of every contestant and of every single skill, with its error.
 
     Args:
-        summary: Columns `contestant`, `kind` ("skill" for a single skill's row), `score`, `score_error`; with `scores`, a
-            list in each row, every one of them is a point.
+        summary: Columns `contestant`, `kind` ("skill" for a single skill's row), `score`, `score_error`; with `scores`,
+            a list in each row, every one of them is a point.
         error: What `score_error` is.
     """
     rows = summary.iloc[::-1]  # bars are drawn from the bottom

@@ -29,3 +29,12 @@ def test_every_row_has_a_bar_of_its_score_and_its_name_beside_it():
     figure.canvas.draw()
     boxes = [label.get_window_extent() for label in ax.get_yticklabels()]
     assert all(below.y1 <= above.y0 for below, above in itertools.pairwise(boxes))
+
+
+def test_every_seed_is_a_point():
+    scores = [[80.0, 100.0], [10.0, 20.0]]
+    rows = {"contestant": ["a", "b"], "kind": "contestant", "score": [90.0, 15.0], "score_error": [14.1, 7.1]}
+    figure = plot_scores(pd.DataFrame({**rows, "scores": scores}), "standard deviation")
+    points = [list(line.get_xdata()) for line in figure.axes[0].lines if line.get_marker() == "o"]
+    assert points == scores[::-1]  # bars are drawn from the bottom
+    assert figure.axes[0].get_xlabel().endswith("± standard deviation")
