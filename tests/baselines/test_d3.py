@@ -71,6 +71,55 @@ class TestWithD3rlpy:
         assert found["q_loss"] == pytest.approx(q_loss, rel=1e-4)
         assert found["v_loss"] == pytest.approx(v_loss, rel=1e-4)
 
+    def test_the_losses_of_td3bc_are_the_authors_formulas(self):
+        torch.manual_seed(0)
+        module, batch = d3.TD3BC(3, 2, hidden_dims=[8, 8], alpha=1.7), batch_of()
+        s, a, after = batch["observations"], batch["actions"], batch["next_observations"]
+        impl, wanted = module.algorithm.impl, module.torch_batch(batch)
+        parts = impl.modules
+        with torch.no_grad():
+            torch.manual_seed(1)
+            smooth = (0.2 * torch.randn(len(s), 2)).clamp(-0.5, 0.5)
+            next_a = (parts.targ_policy(after).squashed_mu + smooth).clamp(-1, 1)
+            next_q = torch.stack([q(after, next_a).q_value.squeeze(-1) for q in parts.targ_q_funcs]).amin(dim=0)
+            y = batch["rewards"] + 0.9 * (1 - batch["dones"]) * next_q
+            both = torch.stack([q(s, a).q_value.squeeze(-1) for q in parts.q_funcs])
+            mine = parts.policy(s).squashed_mu
+            first = parts.q_funcs[0](s, mine).q_value
+        actor_loss = -1.7 / first.abs().mean() * first.mean() + ((mine - a) ** 2).mean()
+        assert impl.compute_actor_loss(wanted, parts.policy(s)).actor_loss.item() == pytest.approx(actor_loss.item())
+        torch.manual_seed(1)
+        found = impl.update(wanted, 0)
+        assert found["critic_loss"] == pytest.approx(((both - y) ** 2).mean(dim=1).sum().item(), rel=1e-4)
+
+    def test_the_conservative_term_of_cql_is_the_authors_formula(self):
+        """Equation 4: log of the integral of exp Q over all actions, minus Q of the data's; here by a sum on a grid."""
+        torch.manual_seed(0)
+        count, weight = 4000, 3.0
+        module = d3.CQL(3, 1, hidden_dims=[8, 8], samples=count, conservatism=weight)
+        batch = {name: value[:6] for name, value in batch_of().items()}
+        s, a, after = batch["observations"], batch["actions"][:, :1], batch["next_observations"]
+        batch["actions"] = a
+        impl = module.algorithm.impl
+        parts = impl.modules
+        grid = torch.linspace(-1, 1, 2001)
+        with torch.no_grad():
+            terms, losses = [], []
+            next_a = parts.policy(after).squashed_mu
+            next_q = torch.stack([q(after, next_a).q_value.squeeze(-1) for q in parts.targ_q_funcs]).amin(dim=0)
+            y = batch["rewards"] + 0.9 * (1 - batch["dones"]) * next_q
+            for q in parts.q_funcs:
+                everywhere = torch.stack([q(s, x.expand(len(s), 1)).q_value.squeeze(-1) for x in grid], dim=1)
+                integral = torch.trapezoid(everywhere.exp(), grid, dim=1).log()
+                data = q(s, a).q_value.squeeze(-1)
+                # d3rlpy adds up its samples of three kinds where the integral is their mean: a constant.
+                terms.append((integral + np.log(3 * count) - data).mean() - module.algorithm.config.alpha_threshold)
+                losses.append(((data - y) ** 2).mean())
+        found = impl.update(module.torch_batch(batch), 0)
+        conservative = weight * sum(terms).item()
+        assert found["conservative_loss"] == pytest.approx(conservative, abs=0.03)  # of terms about 30 each
+        assert found["critic_loss"] - found["conservative_loss"] == pytest.approx(sum(losses).item(), rel=1e-3)
+
     def test_the_loss_of_the_transformer_is_the_authors_formula(self):
         torch.manual_seed(0)
         module, data = small_transformer(), data_of("dt", 20)
