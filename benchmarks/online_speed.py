@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import lightning.pytorch as pl
 import torch
 
@@ -20,42 +21,61 @@ from datamodules.online import OnlineDataModule
 from dds_lightning.callbacks.guard import FiniteGuard
 from dds_lightning.online.sac import SACModule
 
-TASK = "env_id: Pendulum-v1\nmax_episode_steps: 200\nscore_min: -1200\nscore_max: -150\n"
 START = 200
+"""Steps with random actions."""
 
 
-def ours(steps: int) -> float:
-    """Steps per second of processor time of `dds online fit` without its files."""
+def train(env_id: str, steps: int, callback: pl.Callback, seed: int = 0, start: int = START) -> None:
+    """SAC on raw actions with stable-baselines3's settings: `dds online fit` without its files.
+
+    Args:
+        env_id: Of Gymnasium.
+        steps: Updates, one for each environment step after the first `start`.
+        callback: Looks on.
+        seed: Of networks, episodes and batches.
+        start: Environment steps with random actions.
+    """
+    longest = gym.spec(env_id).max_episode_steps
+    pl.seed_everything(seed, verbose=False)
     with tempfile.TemporaryDirectory() as folder:
-        task = Path(folder) / "pendulum.yaml"
-        task.write_text(TASK)
-        data = OnlineDataModule(str(task), actions="raw", updates=1.0, random_steps=START, num_envs=1)
+        task = Path(folder) / "task.yaml"
+        task.write_text(f"env_id: {env_id}\nmax_episode_steps: {longest}\nscore_min: 0\nscore_max: 1\n")
+        data = OnlineDataModule(str(task), actions="raw", updates=1.0, random_steps=start, num_envs=1, seed=seed)
         module = SACModule(data.observation_dim, "raw", data.choices, backup_entropy=True, target_entropy=1.0)
         data.setup("fit")
-        clock: dict[str, float] = {}
-
-        class Clock(pl.Callback):
-            def on_train_batch_end(self, trainer: pl.Trainer, *_: Any) -> None:
-                if trainer.global_step == 50:
-                    clock["start"] = time.process_time()
-
         trainer = pl.Trainer(
-            max_steps=steps + 50,
+            max_steps=steps,
             accelerator="cpu",
             logger=False,
-            callbacks=[Clock(), FiniteGuard()],
+            callbacks=[callback, FiniteGuard()],
             enable_checkpointing=False,
             enable_progress_bar=False,
             enable_model_summary=False,
             limit_val_batches=0,
         )
         trainer.fit(module, data)
-        return steps / (time.process_time() - clock["start"])
+
+
+class Clock(pl.Callback):
+    """Processor time when the first 50 steps are over."""
+
+    began = 0.0
+
+    def on_train_batch_end(self, trainer: pl.Trainer, *_: Any) -> None:
+        """Start after a few steps."""
+        if trainer.global_step == 50:
+            self.began = time.process_time()
+
+
+def ours(steps: int) -> float:
+    """Steps per second of processor time."""
+    clock = Clock()
+    train("Pendulum-v1", steps + 50, clock)
+    return steps / (time.process_time() - clock.began)
 
 
 def theirs(steps: int) -> float:
     """The same of stable-baselines3."""
-    import gymnasium as gym
     from stable_baselines3 import SAC
 
     model = SAC("MlpPolicy", gym.make("Pendulum-v1"), learning_starts=START, batch_size=256, device="cpu", seed=0)

@@ -49,6 +49,8 @@ class Relabelling:
         """Refuse settings out of range."""
         if not 0.0 < self.gamma <= 1.0:
             raise UserError(f"gamma is {self.gamma}, expected a discount in (0, 1]")
+        if self.stride < 1:
+            raise UserError(f"stride is {self.stride}, expected at least 1")
         if self.discount not in ("per_skill", "per_step"):
             raise UserError(f"discount is '{self.discount}', expected per_skill or per_step")
         for name in ("reward_scale", "reward_shift"):

@@ -13,6 +13,7 @@ from datamodules.relabelling import Relabelling
 from dds_lightning.configs import RUN_DEFAULTS, run_defaults
 from dds_lightning.console.reports import Report
 from dds_lightning.errors import UserError
+from dds_lightning.pipeline.trial import refuse_settings
 from dds_lightning.tasks import Task, get_task, is_own
 from dds_lightning.training.alone import run_alone
 from dds_lightning.training.monitors import refuse_late_validation
@@ -106,6 +107,7 @@ class Trainings:
                 self._parse(stage, spec)
             except UserError as error:
                 raise UserError(f"{stage}: {error}") from error
+        refuse_settings(self._parsed, task)
         self._settle_interval()
         if wanted.data is None:
             self.refuse_late_validations(wanted.data_steps + task.max_episode_steps)
