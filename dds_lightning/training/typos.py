@@ -120,7 +120,6 @@ def _given(arguments: Sequence[str]) -> Iterator[_Given]:
             if not equals and option.partition(".")[0] not in FLAGS and not option.endswith(".help"):
                 value = next(words, "")
                 if not value or value.startswith("--"):
-                    words = iter([value, *words])
                     value = MISSING
             yield _Given(option, value or None)
 
