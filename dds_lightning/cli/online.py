@@ -18,7 +18,8 @@ def compare(
     out: str | None = None,
     config: str = "online.yaml",
     workers: int | None = None,
-    set: list[str] = [],  # noqa: B006 - the name of the flag; jsonargparse shows the default
+    variants: list[str] = [],  # noqa: B006 - jsonargparse shows the default
+    set: list[str] = [],  # noqa: B006 - the name of the flag
 ) -> Report:
     """Learn a task online over discrete skills, continuous skills and raw actions, and compare (figure 5).
 
@@ -42,6 +43,7 @@ def compare(
         out: Folder; without it runs/TASK-online.
         config: Settings of `dds online fit`, a packaged configuration or a file.
         workers: Processes for the environments that agents play in; without it one per core.
+        variants: Some of discrete, continuous, raw, prior and offline; without it all whose files are given.
         set: Further arguments of `dds online fit`, for example ["--data.updates=0.1"].
     """
     from dds_lightning.pipeline.compare import Comparison
@@ -62,5 +64,6 @@ def compare(
             workers=workers,
             config=config,
             arguments=tuple(set),
+            chosen=tuple(variants) or None,
         )
     )

@@ -17,6 +17,7 @@ import pandas as pd
 from rich.console import Console
 
 from dds_lightning.agent import DDSAgent
+from dds_lightning.console.refusals import did_you_mean
 from dds_lightning.console.reports import Report, table
 from dds_lightning.errors import UserError
 from dds_lightning.interpret.draw.online import plot_comparison
@@ -39,6 +40,16 @@ CURVE = {
 }
 
 
+VARIANTS = {
+    "discrete": "discrete skills",
+    "continuous": "continuous skills",
+    "raw": "raw actions",
+    "prior": "discrete skills, prior data",
+    "offline": "offline to online",
+}
+"""What `--variants` takes, and how tables and figures call it."""
+
+
 @dataclass(frozen=True)
 class Comparison:
     """What `dds online compare` was asked to do; see its help."""
@@ -55,21 +66,32 @@ class Comparison:
     workers: int | None = None
     config: str = "online.yaml"
     arguments: tuple[str, ...] = ()
+    chosen: tuple[str, ...] | None = None
 
     def variants(self) -> dict[str, list[str]]:
-        """The variants whose files were given: name to arguments of `dds online fit`."""
+        """The variants that were chosen, or all whose files were given: name to arguments of `dds online fit`.
+
+        Raises:
+            UserError: One does not exist, or lacks a file.
+        """
         units = [f"--data.skill={self.skill}"] if self.skill else []
-        found: dict[str, list[str]] = {"raw actions": [*units, "--data.actions=raw"]}
-        if self.gaussian:
-            found = {"continuous skills": [f"--data.skill={self.gaussian}"], **found}
-        if self.skill:
-            found = {"discrete skills": units, **found}
-        if self.skill and self.data:
-            prior = [*units, f"--data.data={self.data}", f"--data.cache={self.out / 'relabel'}"]
-            found["discrete skills, prior data"] = prior
-            if self.policy:
-                found["offline to online"] = [*prior, f"--model.offline={self.policy}"]
-        return found
+        prior = [*units, f"--data.data={self.data}", f"--data.cache={self.out / 'relabel'}"]
+        needs: dict[str, tuple[tuple[str, ...], list[str]]] = {
+            "discrete": (("skill",), units),
+            "continuous": (("gaussian",), [f"--data.skill={self.gaussian}"]),
+            "raw": ((), [*units, "--data.actions=raw"]),
+            "prior": (("skill", "data"), prior),
+            "offline": (("skill", "data", "policy"), [*prior, f"--model.offline={self.policy}"]),
+        }
+        lacks = {key: [f"--{name}" for name in files if not getattr(self, name)] for key, (files, _) in needs.items()}
+        chosen = [key for key in VARIANTS if not lacks[key]] if self.chosen is None else self.chosen
+        for key in chosen:
+            if key not in VARIANTS:
+                near = did_you_mean(key, VARIANTS)
+                raise UserError(f"--variants has {key}, expected some of {', '.join(VARIANTS)}{near}")
+            if lacks[key]:
+                raise UserError(f"--variants has {key}, which needs {' and '.join(lacks[key])} too")
+        return {VARIANTS[key]: needs[key][1] for key in VARIANTS if key in chosen}
 
 
 def compare(asked: Comparison) -> Report:
@@ -104,7 +126,8 @@ def compare(asked: Comparison) -> Report:
         visits = {key: read_npy(one.outputs["visits"]) for key, one in done.items()}
         figure = asked.out / "comparison.png"
         plot_comparison(task, curves, visits).savefig(figure, dpi=150)
-    left = [f"--{name}" for name in ("skill", "gaussian", "data", "policy") if getattr(asked, name) is None]
+    files = ("skill", "gaussian", "data", "policy") if asked.chosen is None else ()
+    left = [f"--{name}" for name in files if getattr(asked, name) is None]
     notes = [f"not given, so not compared: {', '.join(left)}"] if left else []
     data = {"task": task.name, "out": asked.out, "env_steps": asked.env_steps, "table": rows, "figure": figure}
     return Report(data, [table(rows), *notes, f"figure: {figure}"])
@@ -178,7 +201,7 @@ def _train(
 
 
 def _table(variants: Mapping[str, Any], seeds: int, done: Mapping[tuple[str, int], Done]) -> pd.DataFrame:
-    """One row a variant: means over seeds, with the standard deviation of what agents reach when they play."""
+    """One row a variant: means over seeds, with the standard deviation (ddof 1) of what agents reach when they play."""
     rows = []
     for name in variants:
         facts = [done[name, seed].facts for seed in range(seeds)]
@@ -191,7 +214,7 @@ def _table(variants: Mapping[str, Any], seeds: int, done: Mapping[tuple[str, int
                 "seeds": seeds,
                 "env_steps": int(collected["env_steps"].mean()),
                 measure: played[measure].astype(float).mean(),
-                "std": float(played[measure].astype(float).std(ddof=0)),
+                "std": float(played[measure].astype(float).std(ddof=1)),
                 "while learning": _mean(collected, "success" if measure == "success" else "return"),
                 "cells": _mean(collected, "cells"),
             }

@@ -1,9 +1,13 @@
 """`dds online compare`: a row for each variant, one figure, and nothing done twice."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import pandas as pd
 import pytest
 
 from dds_lightning.interpret.draw.online import on_one_grid
+from dds_lightning.pipeline.compare import Comparison
 from tests.fits import TASK, of_data, skill_of, told
 
 TINY = ["--data.batch_size=16", "--data.random_steps=60", "--data.num_envs=2", "--data.updates=0.1"]
@@ -40,6 +44,38 @@ def test_too_few_steps_are_refused_before_anything_is_made(dds, tmp_path):
     answer = dds("online", "compare", TASK, "--env_steps=10", "--out", tmp_path / "out")
     assert answer.status == 2
     assert "--env_steps is 10, expected more than data.random_steps 4000" in told(answer.err)
+    assert not (tmp_path / "out").exists()
+
+
+def test_variants_are_those_whose_files_are_given_or_that_are_named():
+    files = {"skill": "s", "data": "local:d", "policy": "p"}
+    asked = Comparison(TASK, Path("out"), **files)
+    named = replace(asked, chosen=("offline", "prior"))
+    assert list(asked.variants()) == [
+        "discrete skills",
+        "raw actions",
+        "discrete skills, prior data",
+        "offline to online",
+    ]
+    assert list(named.variants()) == ["discrete skills, prior data", "offline to online"]
+    assert "--model.offline=p" in named.variants()["offline to online"]
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (
+            "--variants prio",
+            "--variants has prio, expected some of discrete, continuous, raw, prior, offline: did",
+        ),
+        ("--variants [raw,continuous]", "--variants has continuous, which needs --gaussian too"),
+        ("--variants offline --skill s", "--variants has offline, which needs --data and --policy too"),
+    ],
+)
+def test_a_variant_that_cannot_be_is_refused(dds, tmp_path, words, sentence):
+    answer = dds("online", "compare", TASK, *words.split(), "--out", tmp_path / "out")
+    assert answer.status == 2
+    assert sentence in told(answer.err)
     assert not (tmp_path / "out").exists()
 
 
