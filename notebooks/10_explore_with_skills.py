@@ -51,8 +51,7 @@ warnings.filterwarnings("ignore", module="gymnasium")  # it finds the bounds of 
 # %% tags=["parameters"] quick={"BUDGET": 400, "ENV_STEPS": 4200, "EPISODES": 1}
 SKILLS = "../checkpoints/pointmaze-large"
 BUDGET = 8_000  # environment steps of each wanderer
-ENV_STEPS = 45_000  # environment steps of each training
-UPDATES = 0.04  # optimiser steps for each of them: a fifth of the preset's, to keep this notebook short
+ENV_STEPS = 40_000  # environment steps of each training
 EPISODES = 20
 RUNS = Path("../runs/notebooks/10")  # what this notebook writes lies here
 
@@ -175,7 +174,7 @@ RUNS.mkdir(parents=True, exist_ok=True)
 told = json.loads(
     dds(
         f"online compare {task.name} --skill {SKILLS} --seeds 1 --env_steps {ENV_STEPS} --episodes {EPISODES} "
-        f"--set [--data.updates={UPDATES}] --out {RUNS / 'compare'} --json",
+        f"--out {RUNS / 'compare'} --json",
         curves,
     )
 )
@@ -233,7 +232,7 @@ checks.round(2)
 # %% [markdown]
 # ## Exercises
 #
-# From the top of the repository, three seeds and the paper's budget (half an hour on two cores):
+# From the top of the repository, three seeds and the paper's budget (about an hour):
 #
 # ```bash
 # dds online compare pointmaze-large-diverse --skill checkpoints/pointmaze-large --seeds 3 --out runs/online
