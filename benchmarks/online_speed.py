@@ -41,7 +41,8 @@ def train(env_id: str, steps: int, callback: pl.Callback, seed: int = 0, start: 
         task = Path(folder) / "task.yaml"
         task.write_text(f"env_id: {env_id}\nmax_episode_steps: {longest}\nscore_min: 0\nscore_max: 1\n")
         data = OnlineDataModule(str(task), actions="raw", updates=1.0, random_steps=start, num_envs=1, seed=seed)
-        module = SACModule(data.observation_dim, "raw", data.choices, backup_entropy=True, target_entropy=1.0)
+        theirs = {"backup_entropy": True, "target_entropy": 1.0, "temperature": 1.0}
+        module = SACModule(data.observation_dim, "raw", data.choices, **theirs)
         data.setup("fit")
         trainer = pl.Trainer(
             max_steps=steps,
