@@ -57,6 +57,10 @@ MISSING = "\0"
 """Stands where an option ends the line, or another one follows."""
 
 
+CHOICES = {"mode": ("min", "max")}
+"""Arguments of Lightning's callbacks that take one of a few words, though their type does not say so."""
+
+
 class _Given(NamedTuple):
     """A setting as it was given, on the command line or in a file; a value of None is not looked at."""
 
@@ -186,7 +190,8 @@ def _refuse_names(given: Sequence[_Given]) -> None:
         setting = option.rstrip("+")
         outer = next((name for name in ROOMS if option.startswith(f"{name}.")), None)
         if outer is not None:
-            _refuse_argument(made.get(outer), option.removeprefix(f"{outer}.").removeprefix("init_args."), outer)
+            argument = option.removeprefix(f"{outer}.").removeprefix("init_args.")
+            _refuse_argument(made.get(outer), argument, value, outer)
         elif value is not None and setting in (*WORDS, *ROOMS):
             classes = {name: address for room in ROOMS.get(setting, ()) for name, address in classes_in(room).items()}
             known = (*WORDS.get(setting, ()), *classes)
@@ -196,12 +201,14 @@ def _refuse_names(given: Sequence[_Given]) -> None:
             made[setting] = classes.get(word, "")
 
 
-def _refuse_argument(address: str | None, argument: str, setting: str) -> None:
-    parameters = parameters_of(address) if address else {}
-    if argument in parameters or argument in ("class_path", "dict_kwargs"):
-        return
-    if near := did_you_mean(argument, parameters):
-        raise UserError(f"{setting}: {str(address).rpartition(':')[2]} has no argument {argument}{near}")
+def _refuse_argument(address: str | None, argument: str, value: str | None, setting: str) -> None:
+    parameters, name = parameters_of(address) if address else {}, str(address).rpartition(":")[2]
+    if argument in parameters:
+        known = CHOICES.get(argument, ())
+        if known and value not in (None, *known) and (near := did_you_mean(str(value), known)):
+            raise UserError(f"{setting}: {argument} of {name} is {value}, expected {' or '.join(known)}{near}")
+    elif argument not in ("class_path", "dict_kwargs") and (near := did_you_mean(argument, parameters)):
+        raise UserError(f"{setting}: {name} has no argument {argument}{near}")
 
 
 # ---------------------------------------------------------------------- metrics

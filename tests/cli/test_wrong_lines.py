@@ -35,7 +35,7 @@ LINES = [
     ("S --best.monitor=val/loss --best.every_n_steps=-3", "best.every_n_steps is -3, expected at least 1"),
     (
         "S --trainer.callbacks+=EarlyStopping --trainer.callbacks.monitor=val/loss --trainer.callbacks.mode=maxx",
-        "EarlyStopping: `mode` can be",
+        "mode of EarlyStopping is maxx, expected min or max: did you mean max?",
     ),
     ("S --trainer.callbacks+=Timer --trainer.callbacks.duration=abc", "Timer: `Timer(duration='abc')` is not a valid"),
     (
@@ -196,6 +196,7 @@ TYPOS = [
             "callbacks+=EarlyStoping",
             "callbacks+=EarlyStopping callbacks.moniter=val/loss",
             "callbacks+=EarlyStopping callbacks.monitor=val/los",
+            "callbacks+=EarlyStopping callbacks.monitor=val/loss callbacks.mode=maxx",
             "precision=16-mixd",
             "num_nodes=0",
         )
