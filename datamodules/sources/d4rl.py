@@ -220,15 +220,14 @@ def _fields(file: h5py.File, where: str, task: Task | None) -> dict[str, h5py.Da
     rows = len(fields["rewards"])
     for key, dataset in fields.items():
         shape = dataset.shape
-        if key in ("rewards", "terminals", "timeouts"):
-            fits, expected = shape in ((len(dataset),), (len(dataset), 1)), "(rows,)"
-        else:
+        fits, expected = shape in ((len(dataset),), (len(dataset), 1)), "(rows,)"
+        if key not in ("rewards", "terminals", "timeouts"):
             fits = len(shape) == 2 and shape[1] == widths.get(key, shape[1]) > 0
             expected = f"(rows, {widths[key]})" if key in widths else "(rows, any)"
         if not fits:
             belongs = f" as task '{task.name}' has it" if task else ""
             if task and len(shape) == 2 and key in ("observations", "actions"):
-                belongs += "; these are data of another robot: name their task, or give data of this one"
+                belongs += "; they are another robot's: name their task, or give data of this one"
             raise DataError(f"{where}, {key}: got shape {shape}, expected {expected}{belongs}")
         if len(dataset) != rows:
             raise DataError(f"{where}, {key}: got {len(dataset)} rows, but rewards has {rows}")
