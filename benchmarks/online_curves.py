@@ -19,6 +19,7 @@ import torch
 from matplotlib.figure import Figure
 from online_speed import START, train
 
+COLOURS = {"dds-lightning": "#0072b2", "stable-baselines3": "#d55e00"}
 RESULTS = Path(__file__).parent / "results"
 LATEST = 10
 EVERY = 200
@@ -70,13 +71,9 @@ def draw(table: pd.DataFrame, env_id: str) -> Figure:
     """Every seed as a line."""
     figure = Figure(figsize=(6.4, 3.2), layout="constrained")
     ax = figure.add_subplot()
-    for (name, colour), seeds in zip(
-        (("dds-lightning", "#0072b2"), ("stable-baselines3", "#d55e00")),
-        (table[table["of"] == name] for name in ("dds-lightning", "stable-baselines3")),
-        strict=True,
-    ):
-        for seed, curve in seeds.groupby("seed"):
-            ax.plot(curve["env_steps"], curve["return"], color=colour, alpha=0.8, label=name if seed == 0 else None)
+    for (name, seed), curve in table.groupby(["of", "seed"]):
+        label = name if seed == 0 else None
+        ax.plot(curve["env_steps"], curve["return"], color=COLOURS[name], alpha=0.8, label=label)
     ax.set(xlabel="environment steps", ylabel=f"return of the latest {LATEST} episodes", title=env_id)
     ax.legend(frameon=False)
     ax.spines[["top", "right"]].set_visible(False)
@@ -94,7 +91,7 @@ def main() -> None:
     rows = [
         {"of": name, "seed": seed, "env_steps": step, "return": value}
         for seed in range(asked.seeds)
-        for name, learn in (("dds-lightning", ours), ("stable-baselines3", theirs))
+        for name, learn in zip(COLOURS, (ours, theirs), strict=True)
         for step, value in learn(asked.env_id, asked.steps, seed)
     ]
     table = pd.DataFrame(rows)

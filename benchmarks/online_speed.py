@@ -25,24 +25,23 @@ START = 200
 """Steps with random actions."""
 
 
-def train(env_id: str, steps: int, callback: pl.Callback, seed: int = 0, start: int = START) -> None:
+def train(env_id: str, steps: int, callback: pl.Callback, seed: int = 0) -> None:
     """SAC on raw actions with stable-baselines3's settings: `dds online fit` without its files.
 
     Args:
         env_id: Of Gymnasium.
-        steps: Updates, one for each environment step after the first `start`.
+        steps: Updates, one for each environment step after the first `START`.
         callback: Looks on.
         seed: Of networks, episodes and batches.
-        start: Environment steps with random actions.
     """
     longest = gym.spec(env_id).max_episode_steps
     pl.seed_everything(seed, verbose=False)
     with tempfile.TemporaryDirectory() as folder:
         task = Path(folder) / "task.yaml"
         task.write_text(f"env_id: {env_id}\nmax_episode_steps: {longest}\nscore_min: 0\nscore_max: 1\n")
-        data = OnlineDataModule(str(task), actions="raw", updates=1.0, random_steps=start, num_envs=1, seed=seed)
-        theirs = {"backup_entropy": True, "target_entropy": 1.0, "temperature": 1.0}
-        module = SACModule(data.observation_dim, "raw", data.choices, **theirs)
+        data = OnlineDataModule(str(task), actions="raw", updates=1.0, random_steps=START, num_envs=1, seed=seed)
+        settings = {"backup_entropy": True, "target_entropy": 1.0, "temperature": 1.0}
+        module = SACModule(data.observation_dim, "raw", data.choices, **settings)
         data.setup("fit")
         trainer = pl.Trainer(
             max_steps=steps,

@@ -56,7 +56,7 @@ from datamodules.sources.fetch import find_d4rl
 from datamodules.sources.goal import cut_at_goal, ends_of
 from datamodules.sources.hdf5 import array_in, check_array, member, open_hdf5, read_array, read_rows, row_slices
 from datamodules.sources.plausibility import refuse_other_task
-from datamodules.sources.source import Recording, Source, check_width
+from datamodules.sources.source import FIT, Recording, Source, check_width
 from datamodules.trajectories import Trajectories
 from datamodules.validation import DataError, finite, in_box
 from datamodules.windows import ranges
@@ -220,15 +220,15 @@ def _fields(file: h5py.File, where: str, task: Task | None) -> dict[str, h5py.Da
     rows = len(fields["rewards"])
     for key, dataset in fields.items():
         shape = dataset.shape
-        fits, expected = shape in ((len(dataset),), (len(dataset), 1)), "(rows,)"
-        if key not in ("rewards", "terminals", "timeouts"):
+        if key in ("rewards", "terminals", "timeouts"):
+            fits, expected = shape in ((len(dataset),), (len(dataset), 1)), "(rows,)"
+        else:
             fits = len(shape) == 2 and shape[1] == widths.get(key, shape[1]) > 0
             expected = f"(rows, {widths[key]})" if key in widths else "(rows, any)"
         if not fits:
             belongs = f" as task '{task.name}' has it" if task else ""
-            if task and len(shape) == 2 and key in ("observations", "actions"):
-                belongs += "; they are another robot's: name their task, or give data of this one"
-            raise DataError(f"{where}, {key}: got shape {shape}, expected {expected}{belongs}")
+            remedy = f"; {FIT}" if task and len(shape) == 2 and key in ("observations", "actions") else ""
+            raise DataError(f"{where}, {key}: got shape {shape}, expected {expected}{belongs}{remedy}")
         if len(dataset) != rows:
             raise DataError(f"{where}, {key}: got {len(dataset)} rows, but rewards has {rows}")
     if rows == 0:

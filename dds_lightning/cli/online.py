@@ -64,6 +64,6 @@ def compare(
             workers=workers,
             config=config,
             arguments=tuple(set),
-            chosen=tuple(variants) or None,
+            chosen=tuple(variants),
         )
     )

@@ -66,7 +66,7 @@ class Comparison:
     workers: int | None = None
     config: str = "online.yaml"
     arguments: tuple[str, ...] = ()
-    chosen: tuple[str, ...] | None = None
+    chosen: tuple[str, ...] = ()
 
     def variants(self) -> dict[str, list[str]]:
         """The variants that were chosen, or all whose files were given: name to arguments of `dds online fit`.
@@ -84,7 +84,7 @@ class Comparison:
             "offline": (("skill", "data", "policy"), [*prior, f"--model.offline={self.policy}"]),
         }
         lacks = {key: [f"--{name}" for name in files if not getattr(self, name)] for key, (files, _) in needs.items()}
-        chosen = [key for key in VARIANTS if not lacks[key]] if self.chosen is None else self.chosen
+        chosen = self.chosen or [key for key in VARIANTS if not lacks[key]]
         for key in chosen:
             if key not in VARIANTS:
                 near = did_you_mean(key, VARIANTS)
@@ -126,7 +126,7 @@ def compare(asked: Comparison) -> Report:
         visits = {key: read_npy(one.outputs["visits"]) for key, one in done.items()}
         figure = asked.out / "comparison.png"
         plot_comparison(task, curves, visits).savefig(figure, dpi=150)
-    files = ("skill", "gaussian", "data", "policy") if asked.chosen is None else ()
+    files = () if asked.chosen else ("skill", "gaussian", "data", "policy")
     left = [f"--{name}" for name in files if getattr(asked, name) is None]
     notes = [f"not given, so not compared: {', '.join(left)}"] if left else []
     data = {"task": task.name, "out": asked.out, "env_steps": asked.env_steps, "table": rows, "figure": figure}

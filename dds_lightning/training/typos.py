@@ -221,7 +221,9 @@ def _refuse_metrics(stage: Stage, given: Sequence[_Given], values: Mapping[str, 
     others = any(one.in_file or not (one.value in known or str(one.value).startswith(OURS)) for one in chosen)
     if not stage.metrics or others:
         return
-    watched = [(name, values.get(name)) for name in ("best.monitor", "stop.monitor")]
+    watched = [("best.monitor", values.get("best.monitor"))]
+    if values.get("stop.when", "steps") != "steps":
+        watched.append(("stop.monitor", values.get("stop.monitor")))
     kind = ""
     for name, value, _ in given:
         if name.rstrip("+") == "trainer.callbacks":

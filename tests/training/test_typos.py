@@ -72,6 +72,7 @@ def test_the_arguments_of_a_class_are_found_in_its_source():
         "--data.task=pointmaze-large-diverse?goal=1,1",
         "--model.init_from=hf:somebody/something",
         "--best.monitor=step",
+        "--stop.monitor=my/metric",  # nothing stops by it
     ],
 )
 def test_what_may_be_right_passes(words):
