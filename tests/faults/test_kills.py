@@ -106,13 +106,15 @@ def test_a_collection_killed_at_random_moments_leaves_a_whole_set_or_none(tmp_pa
     hdf5 = Path(f"{TASK}-v0") / "data" / "main_data.hdf5"
     expected = (tmp_path / "straight" / hdf5).read_bytes()
 
+    def collect(folder):
+        # A kill between the set's last rename and the end of the process leaves nothing to do.
+        return 0 if (folder / f"{TASK}-v0").exists() else main([*words, "--out", str(folder)])
+
     def look(folder):
         if (folder / f"{TASK}-v0").exists():
             assert (folder / hdf5).read_bytes() == expected
 
-    told = kill_until_finished(
-        lambda folder: main([*words, "--out", str(folder)]), look, look, tmp_path, seconds=seconds, kills=8, seed=1
-    )
+    told = kill_until_finished(collect, look, look, tmp_path, seconds=seconds, kills=8, seed=1)
     with capsys.disabled():
         print(f"\ncollect: {told}; the same set or none", end="")
 
