@@ -50,6 +50,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from datamodules.loader import TensorLoader
 from dds_lightning.baselines.behaviour_cloning import BehaviourCloning
+from dds_lightning.callbacks.compiled import CompiledLoss
 from dds_lightning.module import StageModule
 from dds_lightning.policy import PolicyModule
 from dds_lightning.saving.files import written_whole
@@ -117,14 +118,16 @@ class Ready(pl.LightningDataModule):
         return TensorLoader(lambda _: self.batch, self.steps, 1)
 
 
-def trained(make: Callable[[], StageModule], batch: Batch, precision: str) -> Callable[[int], None]:
+def trained(
+    make: Callable[[], StageModule], batch: Batch, precision: str, *callbacks: pl.Callback
+) -> Callable[[int], None]:
     """Steps of a module through the Trainer."""
 
     def work(steps: int) -> float:
         usual = {"accelerator": "cpu", "precision": precision, "max_steps": steps + 5, "max_epochs": -1}
         quiet = dict.fromkeys(("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary"), False)
         clock = _Clock()
-        pl.Trainer(**trainer_settings({**usual, **quiet, "callbacks": [clock]}, [])).fit(
+        pl.Trainer(**trainer_settings({**usual, **quiet, "callbacks": [clock, *callbacks]}, [])).fit(
             make(), Ready(batch, steps + 5)
         )
         return clock.seconds
@@ -155,6 +158,9 @@ def contenders() -> Iterator[Contender]:
         for precision in PRECISIONS:
             yield Contender(stage, "module alone", precision, alone(make(), batch, precision), flops, True)
             yield Contender(stage, "through the Trainer", precision, trained(make, batch, precision), flops, True)
+            if stage != "skill":  # whose step hardly consists of anything but products
+                compiled = trained(make, batch, precision, CompiledLoss())
+                yield Contender(stage, "through the Trainer, compiled", precision, compiled, flops, True)
         for name, peer in PEERS.get(stage.partition(",")[0], {}).items():
             try:
                 update = peer(batch, SKILLS)

@@ -1,0 +1,59 @@
+"""Compile the loss of a training."""
+
+import shutil
+from typing import Any, Literal
+
+import lightning.pytorch as pl
+import torch
+from lightning.pytorch.callbacks import Callback
+
+from dds_lightning.errors import UserError
+
+COMPILERS = ("g++", "clang++", "c++")
+
+
+class CompiledLoss(Callback):
+    """Compile the module's loss, forward and backward, with `torch.compile`; networks and checkpoints stay as they are.
+
+    Operations between matrix products are fused, so rounding differs a little from a training without it. Worth it for
+    small networks in bfloat16 (`benchmarks/LOG.md`), and on a GPU, where mode ``reduce-overhead`` replays a step as
+    CUDA graphs. The first step takes up to a minute.
+
+    Args:
+        mode: Of `torch.compile`; the last three take minutes to try out kernels, or need a GPU.
+        backend: Of `torch.compile`: ``aot_eager`` needs no compiler and gains nothing, for tests.
+    """
+
+    def __init__(
+        self,
+        mode: Literal["default", "reduce-overhead", "max-autotune", "max-autotune-no-cudagraphs"] = "default",
+        backend: Literal["inductor", "cudagraphs", "aot_eager"] = "inductor",
+    ) -> None:
+        self.mode, self.backend = mode, backend
+
+    def on_fit_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Put the compiled loss before the module's own, which validation goes on using.
+
+        Raises:
+            UserError: There is no compiler for the processor's code.
+        """
+        own: Any = pl_module.loss
+        if self.backend == "inductor" and pl_module.device.type == "cpu" and not any(map(shutil.which, COMPILERS)):
+            raise UserError(
+                "compiled loss: on a CPU it needs a C++ compiler (g++ or clang++), and none was found: install one, "
+                "or train without this callback"
+            )
+        mode = self.mode if self.backend == "inductor" else None  # the others know none
+        compiled = torch.compile(own, backend=self.backend, mode=mode)
+
+        def loss(batch: Any) -> Any:
+            if not pl_module.training:
+                return own(batch)
+            torch.compiler.cudagraph_mark_step_begin()  # what the last step returned may be overwritten
+            return compiled(batch)
+
+        pl_module.loss = loss  # type: ignore[assignment]
+
+    def teardown(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
+        """Give the module its own loss back."""
+        pl_module.__dict__.pop("loss", None)
