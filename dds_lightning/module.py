@@ -44,6 +44,7 @@ class StageModule(pl.LightningModule):
     action_box: ActionBox  # of modules that see actions
     init_from: str | None = None  # the checkpoint this module started from, in this process
     _held: Mapping[str, Sequence[nn.Parameter]] = MappingProxyType({})  # submodules that stand still, and their weights
+    learning: tuple[str, ...] = ()  # what `learning_at` said of the present step
     terms: Mapping[str, Tensor] = MappingProxyType({})  # of the last training step; `FiniteGuard` names the bad ones
 
     def _refuse(self, rules: Sequence[tuple[str, bool, str]]) -> None:
@@ -98,6 +99,14 @@ class StageModule(pl.LightningModule):
     def _with_weights(self, names: Iterable[str]) -> list[str]:
         return [name for name in names if any(True for _ in getattr(self, name).parameters())]
 
+    def learning_at(self, step: int) -> tuple[str, ...]:
+        """Names of the parts that learn at an optimiser step, in the loss of one whose parts take turns."""
+        return self.trained_parts
+
+    def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
+        """Note what learns in this step: a loss that asked for the step itself would be compiled anew for every one."""
+        self.learning = self.learning_at(self.global_step)
+
     def hold(self, names: Sequence[str]) -> None:
         """Let submodules stand still from now on; the others go on learning.
 
@@ -116,6 +125,7 @@ class StageModule(pl.LightningModule):
 
     def _begin(self, init_from: str | os.PathLike[str] | None) -> None:
         """Freeze what is not trained and load the weights to start from."""
+        self.learning = self.learning_at(0)
         for name in self.frozen_modules:
             getattr(self, name).requires_grad_(False)
         self.train(self.training)  # a Trainer does not change modes

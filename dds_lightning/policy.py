@@ -231,13 +231,12 @@ class PolicyModule(StageModule):
         """Features (B, F) to the smaller target Q of every code (B, K)."""
         return self.target_critic(features.expand(2, *features.shape)).amin(dim=0)
 
-    @property
-    def learning(self) -> tuple[str, ...]:
-        """The parts that learn in this step: with ``after`` first the critic, then the actor."""
+    def learning_at(self, step: int) -> tuple[str, ...]:
+        """The parts that learn: with ``after`` first the critic, then the actor."""
         parts = self.trained_parts
         if self.hparams.extraction == "joint" or len(parts) == 1:
             return parts
-        return ("critic",) if self.global_step < self.hparams.critic_steps else ("actor",)
+        return ("critic",) if step < self.hparams.critic_steps else ("actor",)
 
     def value_loss(self, judged: Judged) -> Loss:
         """Equation 6: V(s) as an expectile of the smaller target Q."""

@@ -93,10 +93,14 @@ class LDCQ(LatentModule):
     def loss(self, batch: Batch) -> Loss:
         """Equation 6 in the first ``prior_steps`` steps, equation 7 after."""
         x, z = self.normaliser(batch["observations"]), self.skills(batch["actions"])
-        if self.global_step < self.hparams.prior_steps:
+        if "prior" in self.learning:
             return self._sum({"prior_loss": self.prior_loss(x, z)}, {})
         q = self.critic.both(x, z)
         return self._sum({"q_loss": losses.td(q, self._target(batch))}, {"q_mean": q.mean()})
+
+    def learning_at(self, step: int) -> tuple[str, ...]:
+        """First the prior, then the critic."""
+        return ("prior",) if step < self.hparams.prior_steps else ("critic",)
 
     def prior_loss(self, states: Tensor, skills: Tensor) -> Tensor:
         """Equation 6 for normalised states (B, O) and skills (B, D), the mean over B and D."""

@@ -29,6 +29,8 @@ class EnsembleLinear(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply member n to x[n]."""
+        if self.weight.shape[-1] == 1:  # one column as a batched product: 140 us for 256 rows of 256, as a sum 40 us
+            return (x * self.weight.mT).sum(dim=-1, keepdim=True) + self.bias
         return torch.baddbmm(self.bias, x, self.weight)
 
 

@@ -193,8 +193,7 @@ class SACModule(StageModule):
 
     def v(self, observations: Tensor) -> Tensor:
         """Value of the policy, ``E[Q]`` under the target critics: (B, O) to (B,)."""
-        features = self.embed(observations)
-        return self.actor.expect(features, self.support_mask, self._judge_target).q
+        return self.actor.expect(self.embed(observations), self.support_mask, self._judge_target).q
 
     def codes(
         self,
@@ -207,8 +206,7 @@ class SACModule(StageModule):
         if selection != "sample":
             scores = self.q(observations) if selection == "argmax_q" else self.logits(observations)
             return scores.masked_fill(~self.support_mask, -torch.inf).argmax(dim=-1)
-        probabilities = (self.logits(observations) / temperature).softmax(dim=-1)
-        return categorical(probabilities, generator)
+        return categorical((self.logits(observations) / temperature).softmax(dim=-1), generator)
 
     def choose(
         self,
@@ -236,9 +234,8 @@ class SACModule(StageModule):
         if selection not in ("sample", "greedy"):
             raise UserError(f"selection is '{selection}', expected sample or greedy: {self.hparams.space} has no codes")
         features = self.embed(observations)
-        unit = self.actor.moments(features)[0].tanh()
-        if selection == "sample":
-            unit = self.actor.sample(features, generator)[0]
+        sampled = selection == "sample"
+        unit = self.actor.sample(features, generator)[0] if sampled else self.actor.moments(features)[0].tanh()
         return self.action_box.from_unit(unit)
 
     # ---------------------------------------------------------------- learning
@@ -263,8 +260,7 @@ class SACModule(StageModule):
     def _judge_frozen(self, inputs: Tensor) -> Tensor:
         """The critics' joint verdict; gradients reach the inputs and not the critics."""
         weights = {name: value.detach() for name, value in self.critic.named_parameters()}
-        wide = inputs.expand(self.hparams.critics, *inputs.shape)
-        return self._agree(functional_call(self.critic, weights, wide))
+        return self._agree(functional_call(self.critic, weights, inputs.expand(self.hparams.critics, *inputs.shape)))
 
     def loss(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """Sum of the losses of critics, policy and temperature; its terms and their statistics, detached."""
@@ -285,7 +281,7 @@ class SACModule(StageModule):
         terms = {"q_loss": losses.td(q, target)}
         if self.novelty is not None:
             terms["novelty_loss"] = self.novelty.loss(batch, self._transition(batch, features.detach()))
-        learns = self.global_step >= self.hparams.actor_start
+        learns = "actor" in self.learning
         with torch.set_grad_enabled(learns and torch.is_grad_enabled()):
             # Over codes the values of all choices are there already; over numbers the policy makes a new choice.
             judge = (lambda _: self._agree(values.detach())) if self.discrete else self._judge_frozen
@@ -305,6 +301,10 @@ class SACModule(StageModule):
         taken = batch["actions"]
         choice = one_hot(taken, self.num_skills) if self.discrete else self.action_box.to_unit(taken)
         return torch.cat([features, choice], dim=-1)
+
+    def learning_at(self, step: int) -> tuple[str, ...]:
+        """The critics, and from ``actor_start`` on the policy."""
+        return self.trained_parts if step >= self.hparams.actor_start else ("critic",)
 
     def on_fit_start(self) -> None:
         """Take the units and the skills to follow from the data, and policy and critics from offline training."""

@@ -69,7 +69,7 @@ def test_ldcqs_losses_are_the_authors_formulas():
     prior_loss = ((kept / (1 - kept)).clamp(max=5.0) * (z - guess) ** 2).mean()
     assert total.item() == pytest.approx(prior_loss.item(), rel=1e-4)
 
-    module.hparams.prior_steps = 0
+    module.learning = module.learning_at(1)
     torch.manual_seed(1)
     total, _ = module.loss(batch)
     torch.manual_seed(1)

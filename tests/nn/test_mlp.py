@@ -7,13 +7,14 @@ from torch import nn
 from dds_lightning.nn.mlp import MLP, EnsembleLinear, FourierFeatures
 
 
-def test_an_ensemble_of_linear_layers_is_that_many_linear_layers():
+@pytest.mark.parametrize("width", [2, 1])
+def test_an_ensemble_of_linear_layers_is_that_many_linear_layers(width):
     torch.manual_seed(0)
-    ensemble, x = EnsembleLinear(3, 4, 2), torch.randn(3, 5, 4)
-    weight = torch.randn(3, 5, 2)
+    ensemble, x = EnsembleLinear(3, 4, width), torch.randn(3, 5, 4)
+    weight = torch.randn(3, 5, width)
     (ensemble(x) * weight).sum().backward()
     for n in range(3):
-        alone = nn.Linear(4, 2)
+        alone = nn.Linear(4, width)
         with torch.no_grad():
             alone.weight.copy_(ensemble.weight[n].T)
             alone.bias.copy_(ensemble.bias[n, 0])

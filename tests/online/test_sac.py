@@ -170,12 +170,12 @@ def test_numbers_are_in_their_box_and_greedy_is_the_mode(space):
         module.choose(x, "argmax_q")
 
 
-def test_a_fixed_temperature_does_not_learn_and_a_late_policy_waits(monkeypatch):
+def test_a_fixed_temperature_does_not_learn_and_a_late_policy_waits():
     assert not module_of("discrete", target_entropy=None).log_alpha.requires_grad
     module, batch = module_of("discrete", actor_start=10), batch_of("discrete")
     total, _ = module.loss(batch)
     assert gradients(total, module.actor.parameters()) == (None,) * 6
-    monkeypatch.setattr(SACModule, "global_step", 10)
+    module.learning = module.learning_at(10)
     total, _ = module.loss(batch)
     assert all(gradient is not None for gradient in gradients(total, module.actor.parameters()))
 
