@@ -22,8 +22,11 @@ from dds_lightning.errors import UserError, refuse_seed
 from dds_lightning.saving.files import home
 from dds_lightning.skill import SkillModule
 from dds_lightning.tasks import Task, get_task
+from dds_lightning.training.precision import fastest_precision
 
 log = logging.getLogger(__name__)
+LONG = 20_000
+"""Segments from which on it is worth measuring whether the encoder is faster in bfloat16."""
 
 
 class RelabeledDataModule(pl.LightningDataModule):
@@ -143,10 +146,15 @@ class RelabeledDataModule(pl.LightningDataModule):
             self.relabel_into(self.cache_file())
 
     def relabel_into(self, path: Path) -> Relabelled:
-        """Relabel and write the result to `path`; repeating a call that was stopped continues it."""
-        partial = PartialCodes(path, self.key)
+        """Relabel and write the result to `path`; repeating a call that was stopped continues it.
+
+        Much data are encoded in bfloat16 where that is faster, as in a training with `precision: auto`.
+        """
         relabelling = self.relabelling.for_task(self.task)
-        made = relabel(self.trajectories, self.skill, relabelling, progress=True, partial=partial)
+        long = len(self.trajectories.rewards) > LONG * relabelling.stride
+        precision: Any = fastest_precision().precision if long else "32-true"
+        partial = PartialCodes(path, {**self.key, "precision": precision})
+        made = relabel(self.trajectories, self.skill, relabelling, precision=precision, progress=True, partial=partial)
         made.save(path, self.key)
         partial.remove()
         log.info("relabelled %d segments into %s", len(made), path)

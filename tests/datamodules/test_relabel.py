@@ -14,6 +14,7 @@ from jsonargparse import ArgumentParser
 from safetensors.torch import save_file
 
 import datamodules.relabel as relabelling
+import datamodules.relabelled as relabelled
 from datamodules.relabel import Relabelled, relabel, relabel_key
 from datamodules.relabelled import RelabeledDataModule
 from datamodules.relabelling import Relabelling
@@ -22,6 +23,7 @@ from dds_lightning.errors import UserError
 from dds_lightning.policy import PolicyModule
 from dds_lightning.skill import SkillModule
 from dds_lightning.tasks import get_task
+from dds_lightning.training.precision import Choice
 from tests.modules import fit
 
 SMALL = {"hidden_dim": 16, "encoder_layers": 1, "encoder_heads": 2, "decoder_blocks": 1, "skill_dim": 8}
@@ -226,6 +228,24 @@ def module(trajectories, skill, folder, **settings) -> RelabeledDataModule:
         batch_size=4,
         **settings,
     )
+
+
+def test_much_data_are_encoded_in_the_faster_precision_and_only_codes_may_differ(
+    trajectories, skill, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(relabelled, "fastest_precision", lambda: Choice("bf16-mixed", 2.0))
+    used = []
+    encode = SkillModule.encode
+    monkeypatch.setattr(
+        SkillModule, "encode", lambda *given: used.append(torch.is_autocast_enabled("cpu")) or encode(*given)
+    )
+    exact = module(trajectories, skill, tmp_path).relabel_into(tmp_path / "few.safetensors")
+    monkeypatch.setattr(relabelled, "LONG", 5)
+    fast = module(trajectories, skill, tmp_path).relabel_into(tmp_path / "many.safetensors")
+    assert used == [False, True]
+    for name in ("observations", "rewards", "next_observations", "discounts", "dones", "starts", "episodes"):
+        assert torch.equal(getattr(exact, name), getattr(fast, name)), name
+    assert (exact.codes == fast.codes).float().mean() > 0.7
 
 
 def test_the_data_module_relabels_once_and_splits_by_episode(trajectories, skill, tmp_path):
