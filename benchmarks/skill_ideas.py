@@ -23,10 +23,10 @@ from torch import Tensor, nn
 
 from datamodules.segments import SegmentDataModule
 from dds_lightning.configs import find
+from dds_lightning.nn.precision import fastest_precision
 from dds_lightning.saving.untrusted import read_yaml
 from dds_lightning.skill import START_BATCHES, SkillModule
 from dds_lightning.tasks import get_task
-from dds_lightning.training.precision import fastest_precision
 
 Optimisers = Callable[[SkillModule, float], list[torch.optim.Optimizer]]
 

@@ -19,9 +19,9 @@ from datamodules.relabel import relabel
 from datamodules.trajectories import Trajectories
 from dds_lightning.agent import DDSAgent
 from dds_lightning.envs.pool import EnvPool
+from dds_lightning.nn.precision import fastest_precision
 from dds_lightning.skill import SkillModule
 from dds_lightning.tasks import Task, get_task
-from dds_lightning.training.precision import fastest_precision
 
 SLOTS = 50
 
@@ -68,9 +68,8 @@ def compare_relabelling(skill: SkillModule, segments: int, rounds: int) -> None:
             began = time.process_time()
             count = work()
             best[name] = max(best[name], count / (time.process_time() - began))
-    print(
-        f"relabelling in {precision}: {best['relabel']:,.0f} segments/s, {best['relabel'] / best['plain loop']:.1f} times a loop's"
-    )
+    ratio = best["relabel"] / best["plain loop"]
+    print(f"relabelling in {precision}: {best['relabel']:,.0f} segments/s, {ratio:.1f} times a loop's")
 
 
 def steps_per_second(task: Task, agent: DDSAgent | None, steps: int) -> float:

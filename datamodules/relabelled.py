@@ -19,10 +19,10 @@ from datamodules.relabelling import Relabelling
 from datamodules.sources import load_trajectories
 from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError, refuse_seed
+from dds_lightning.nn.precision import fastest_precision
 from dds_lightning.saving.files import home
 from dds_lightning.skill import SkillModule
 from dds_lightning.tasks import Task, get_task
-from dds_lightning.training.precision import fastest_precision
 
 log = logging.getLogger(__name__)
 LONG = 20_000

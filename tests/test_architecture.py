@@ -56,7 +56,7 @@ ROOMS = {
     "datamodules.trajectories",
     "datamodules.segments": "errors nn tasks datamodules.collect datamodules.loader datamodules.sources "
     "datamodules.trajectories",
-    "datamodules.relabelled": "errors saving skill tasks datamodules.loader datamodules.partial_codes "
+    "datamodules.relabelled": "errors nn saving skill tasks datamodules.loader datamodules.partial_codes "
     "datamodules.relabel "
     "datamodules.relabelling datamodules.sources datamodules.trajectories",
     "datamodules.transitions": "envs errors skill datamodules.loader datamodules.relabel datamodules.relabelling "
@@ -65,7 +65,7 @@ ROOMS = {
     "datamodules.relabelling",
     # training
     "dds_lightning.callbacks": "agent console envs errors online policy rollout skill tasks",
-    "dds_lightning.training": "callbacks configs console errors finetune module saving tasks",
+    "dds_lightning.training": "callbacks configs console errors finetune module nn saving tasks",
     "dds_lightning.baselines": "agent errors losses module nn online policy rollout saving skill tasks training",
     # what came of it
     "dds_lightning.interpret.views": "errors tasks",

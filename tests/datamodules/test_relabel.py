@@ -20,10 +20,10 @@ from datamodules.relabelled import RelabeledDataModule
 from datamodules.relabelling import Relabelling
 from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError
+from dds_lightning.nn.precision import Choice
 from dds_lightning.policy import PolicyModule
 from dds_lightning.skill import SkillModule
 from dds_lightning.tasks import get_task
-from dds_lightning.training.precision import Choice
 from tests.modules import fit
 
 SMALL = {"hidden_dim": 16, "encoder_layers": 1, "encoder_heads": 2, "decoder_blocks": 1, "skill_dim": 8}

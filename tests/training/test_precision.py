@@ -1,20 +1,11 @@
 """The measured choice of a precision, and who overrules it."""
 
 import pytest
-import torch
 
+from dds_lightning.nn.precision import Choice
 from dds_lightning.training import precision
-from dds_lightning.training.precision import Choice, fastest_precision
 from dds_lightning.training.stage_cli import StageCLI
 from tests.fits import QUIET, SKILL, call, of_data, told
-
-
-def test_the_measurement_gives_one_of_two_precisions_and_draws_nothing():
-    before = torch.get_rng_state()
-    choice = fastest_precision()
-    assert choice.speedup > 0
-    assert choice.precision == ("bf16-mixed" if choice.speedup > 1.2 else "32-true")
-    assert torch.equal(torch.get_rng_state(), before)
 
 
 @pytest.mark.parametrize(

@@ -126,10 +126,11 @@ def test_usage_counts_the_codes_of_all_processes(monkeypatch):
 def test_the_processes_of_a_training_have_one_precision(monkeypatch):
     from jsonargparse import Namespace
 
+    from dds_lightning.nn.precision import Choice
     from dds_lightning.training import precision
 
     def settled(choice):
-        monkeypatch.setattr(precision, "fastest_precision", lambda gpu: precision.Choice(choice, 2.0))
+        monkeypatch.setattr(precision, "fastest_precision", lambda gpu: Choice(choice, 2.0))
         return precision.settle_precision(
             Namespace(precision="auto", trainer=Namespace(precision=None, accelerator="cpu"))
         )
