@@ -77,6 +77,7 @@ class PolicyModule(StageModule):
             not chosen there: their Q was hardly learnt.
         beta_ratio: The same for codes to which it gives less than this share of what it gives the likeliest code, as
             discrete BCQ does (Fujimoto et al., 2019); 0 leaves none out, 1 all but that one.
+        dropout: Share of the policy network's hidden numbers left out in a training step: few data are learnt by heart.
         target_ema: Rate of the target network.
         extraction: ``after`` trains the critic for ``critic_steps``, then the policy on the frozen critic (the
             paper); ``joint`` trains them together.
@@ -122,6 +123,7 @@ class PolicyModule(StageModule):
         awr: Solution = "regression",
         beta_floor: float = 0.01,
         beta_ratio: float = 0.0,
+        dropout: float = 0.0,
         target_ema: float = 0.005,
         extraction: Literal["after", "joint"] = "after",
         critic_steps: int = 1_000_000,
@@ -149,6 +151,7 @@ class PolicyModule(StageModule):
             ("awr", awr in get_args(Solution), " or ".join(get_args(Solution))),
             ("beta_floor", 0 <= beta_floor < 1 / num_skills, f"in [0, 1/{num_skills})"),
             ("beta_ratio", 0 <= beta_ratio <= 1, "in [0, 1]"),
+            ("dropout", 0 <= dropout < 1, "in [0, 1)"),
             ("target_ema", 0 < target_ema <= 1, "in (0, 1]"),
             ("support", 0 <= support < 1 / num_skills, f"in [0, 1/{num_skills})"),
         ]
@@ -165,8 +168,7 @@ class PolicyModule(StageModule):
         self.target_critic = MLP(width, num_skills, hidden_dims, layer_norm, members=2)
         self.target_critic.load_state_dict(self.critic.state_dict())
         self.target_critic.requires_grad_(False)
-        self.actor = MLP(width, num_skills, hidden_dims)
-        # Filled when a fit starts: which codes the data support, and which values rewards and discounts allow.
+        self.actor = MLP(width, num_skills, hidden_dims, dropout=dropout)
         self.register_buffer("support_mask", torch.ones(num_skills, dtype=torch.bool))
         self.register_buffer("value_range", torch.tensor([-torch.inf, torch.inf]))
         if alpha_unit == "spread":
@@ -233,9 +235,8 @@ class PolicyModule(StageModule):
 
     def learning_at(self, step: int) -> tuple[str, ...]:
         """The parts that learn: with ``after`` first the critic, then the actor."""
-        parts = self.trained_parts
-        if self.hparams.extraction == "joint" or len(parts) == 1:
-            return parts
+        if self.hparams.extraction == "joint" or len(self.trained_parts) == 1:
+            return self.trained_parts
         return ("critic",) if step < self.hparams.critic_steps else ("actor",)
 
     def value_loss(self, judged: Judged) -> Loss:

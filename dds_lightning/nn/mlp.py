@@ -70,6 +70,7 @@ class MLP(nn.Sequential):
         hidden_dims: Widths of the hidden layers (the paper: 256, 256).
         layer_norm: Normalise before each ReLU.
         members: 0 for a plain network (..., I) to (..., J); N for an ensemble (N, B, I) to (N, B, J).
+        dropout: Share of hidden numbers that are left out in a training step.
     """
 
     def __init__(
@@ -79,6 +80,7 @@ class MLP(nn.Sequential):
         hidden_dims: Sequence[int] = (256, 256),
         layer_norm: bool = False,
         members: int = 0,
+        dropout: float = 0.0,
     ) -> None:
         def linear(i: int, j: int) -> nn.Module:
             return EnsembleLinear(members, i, j) if members else nn.Linear(i, j)
@@ -91,12 +93,15 @@ class MLP(nn.Sequential):
             layers.append(nn.ReLU())
             input_dim = hidden_dim
         super().__init__(*layers, linear(input_dim, output_dim))
+        self.dropout = dropout
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply the layers."""
         *hidden, last = self
         for layer in hidden:
             x = layer(x)
+            if self.dropout and isinstance(layer, nn.ReLU):  # no layer of its own: names in checkpoints stay
+                x = nn.functional.dropout(x, self.dropout, self.training)
         with in_full_precision(x):
             out: Tensor = last(x.to(next(last.parameters()).dtype))
         return out

@@ -31,6 +31,8 @@ _EVIDENCE = (
     ("expected_fall", "fall of held-out loss with a quarter more skill steps, %", ".1f", 100.0),
     ("fidelity", "error of replayed skills, in distances between two segments", ".3f", 1.0),
     ("fidelity_clone", "the same for behaviour cloning", ".3f", 1.0),
+    ("beta_loss", "cross entropy of held-out skills by the data's policy, nats", ".2f", 1.0),
+    ("share_loss", "the same by the skills' shares in the data", ".2f", 1.0),
     ("critic_rank", "rank correlation of V with returns of held-out episodes", ".2f", 1.0),
     ("policy_shift", "way of the policy from the data's to the critic's best code, %", ".0f", 100.0),
 )

@@ -4,7 +4,7 @@
  data ──► how many episodes end early and no termination says why
  skills ─► codes in use, fidelity in the simulator, how much held-out loss was still falling
  critic ─► rank correlation of V with the returns of held-out episodes
- policy ─► how far it has moved from the policy of the data
+ policy ─► how far it has moved from the policy of the data, and whether it learnt that one by heart
 ```
 """
 
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from torch.nn.functional import cross_entropy
 
 from dds_lightning.errors import UserError
 
@@ -90,7 +91,9 @@ def policy_evidence(data: RelabeledDataModule, policy: PolicyModule) -> dict[str
     Returns:
         `critic_rank`: Spearman's correlation of V with the discounted return to the episode's end; and with
         ``awr: closed_form`` `policy_shift`: KL(pi || beta) as a share of the most that any choice among the codes of
-        the data gives, 0 for the policy of the data, 1 for always the critic's best code.
+        the data gives, 0 for the policy of the data, 1 for always the critic's best code; and, where episodes are held
+        out, `beta_loss` and `share_loss`: cross entropy, in nats, of their codes under beta and under the plain shares
+        of the codes in the data.
     """
     from scipy.stats import spearmanr
 
@@ -108,6 +111,11 @@ def policy_evidence(data: RelabeledDataModule, policy: PolicyModule) -> dict[str
     found = {"critic_rank": 0.0 if np.isnan(rank) else rank}
     if policy.hparams.awr == "closed_form":
         found["policy_shift"] = policy_shift(policy, states)
+        if len(data.validation_index):
+            codes, shares = data.transitions.codes[index], data.statistics()["code_share"]
+            beta = policy.actor(policy.embed(states.to(policy.device))).cpu()
+            found["beta_loss"] = float(cross_entropy(beta, codes))
+            found["share_loss"] = float(cross_entropy(shares.clamp_min(1e-6).log().expand(len(codes), -1), codes))
     return found
 
 

@@ -5,6 +5,7 @@
    │ no
    ├─ episodes end early, no termination says why ──► data
    ├─ fewer than half of the codes in use ──────────► skills
+   ├─ beta is worse than the codes' plain shares ───► policy
    ├─ V does not rank held-out returns ─────────────► critic
    ├─ pi is beta, or always the best code ──────────► policy
    └─ otherwise, what copies the data worst ────────► skills
@@ -78,6 +79,13 @@ def verdict(scores: Mapping[str, float], evidence: Mapping[str, float]) -> Verdi
             f"Skills: only {evidence['codes_used']:.0f} of {evidence['num_skills']:.0f} codes are in use. "
             "Keep codebook_init=kmeans and restart_threshold above 0, lower --skill.model.lr, or ask for fewer codes "
             "with --skill.model.num_skills.",
+        )
+    if ask("beta_loss", 0.0) > ask("share_loss", math.inf):
+        return Verdict(
+            "policy",
+            "Policy: it knows the data by heart. The skills of held-out episodes are less likely by it "
+            f"({evidence['beta_loss']:.1f} nats) than by their plain shares ({evidence['share_loss']:.1f}). Raise "
+            "--policy.model.dropout, or lower --policy.trainer.max_steps.",
         )
     if ask("critic_rank", 1.0) < CRITIC_RANK:
         return Verdict(

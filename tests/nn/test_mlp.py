@@ -31,6 +31,19 @@ def test_members_start_apart_within_the_bounds_of_a_linear_layer():
     assert 0.24 < layer.weight.abs().max() <= 0.25  # 1 / sqrt(16)
 
 
+def test_dropout_leaves_out_hidden_numbers_of_training_steps_alone_and_adds_no_name():
+    torch.manual_seed(0)
+    plain, dropping = MLP(3, 2, (64, 64)), MLP(3, 2, (64, 64), dropout=0.5)
+    dropping.load_state_dict(plain.state_dict())
+    x = torch.randn(5, 3)
+    assert torch.equal(plain(x), dropping.eval()(x))
+    dropping.train()
+    drawn = torch.stack([dropping(x) for _ in range(2000)])
+    assert drawn.std(dim=0).min() > 0.05
+    one = MLP(3, 2, (64,), dropout=0.5)  # with one hidden layer the mean over what is left out is exact
+    torch.testing.assert_close(torch.stack([one(x) for _ in range(4000)]).mean(dim=0), one.eval()(x), atol=0.05, rtol=0)
+
+
 def test_layer_norm_stands_before_each_relu_and_nowhere_else():
     kinds = [type(layer).__name__ for layer in MLP(3, 2, (8, 8), layer_norm=True)]
     assert kinds == ["Linear", "LayerNorm", "ReLU", "Linear", "LayerNorm", "ReLU", "Linear"]

@@ -1,5 +1,7 @@
 """Evidence about stages: shares of episodes, ranks of values, and how far a policy has moved."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -57,6 +59,26 @@ def test_the_critic_is_ranked_by_returns_to_go(tmp_path):
     assert policy_evidence(data, policy)["critic_rank"] == pytest.approx(-1.0, abs=0.05)
     policy.v = lambda observations: torch.zeros(len(observations))
     assert policy_evidence(data, policy)["critic_rank"] == 0.0
+
+
+def test_the_policy_of_the_data_is_asked_about_held_out_skills(tmp_path):
+    """An actor with equal logits gives each of four codes a quarter; shares are those of the training data."""
+    torch.manual_seed(0)
+    skill = SkillModule(2, 1, horizon=3, num_skills=4, **SMALL)
+    path = tmp_path / "skill.ckpt"
+    torch.save({"state_dict": skill.state_dict(), "hyper_parameters": dict(skill.hparams)}, path)
+    data = RelabeledDataModule.from_trajectories(walks([40] * 4, [False] * 4), str(path), validation_fraction=0.5)
+    data.prepare_data()
+    data.setup()
+    policy = PolicyModule(2, 4, hidden_dims=[8], awr="closed_form")
+    for parameter in policy.actor.parameters():
+        torch.nn.init.zeros_(parameter)
+    found = policy_evidence(data, policy)
+    assert found["beta_loss"] == pytest.approx(math.log(4), abs=1e-5)
+    counts = torch.bincount(data.transitions.codes[data.train_index], minlength=4).float()
+    shares = (counts / counts.sum()).clamp_min(1e-6)
+    held = data.transitions.codes[data.validation_index]
+    assert found["share_loss"] == pytest.approx(-shares[held].log().mean().item(), abs=1e-5)
 
 
 def test_the_shift_runs_from_the_datas_policy_to_the_critics_best_code():

@@ -12,6 +12,8 @@ EVIDENCE = {
     "terminates": 0.5,
     "codes_used": 16,
     "num_skills": 16,
+    "beta_loss": 1.9,
+    "share_loss": 2.7,
     "critic_rank": 0.7,
     "policy_shift": 0.3,
     "expected_fall": 0.08,
@@ -25,6 +27,11 @@ EVIDENCE = {
     [
         ({"terminates": 0.0}, "data", "Data: 50 % of the episodes end early, but none by a termination"),
         ({"codes_used": 4}, "skill", "Skills: only 4 of 16 codes are in use"),
+        (
+            {"beta_loss": 8.8, "critic_rank": 0.05},
+            "policy",
+            r"heart\. .* likely by it \(8.8 nats\) than by their plain shares \(2.7\)\. Raise --policy.model.dropout",
+        ),
         ({"critic_rank": 0.05}, "policy", r"Critic: .* \(correlation 0.05, expected above 0.3\)"),
         ({"policy_shift": 0.0}, "policy", "the same as the data's .* raise --policy.model.alpha"),
         ({"policy_shift": 0.95}, "policy", "nearly always the critic's best .* lower --policy.model.alpha"),
