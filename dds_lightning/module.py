@@ -305,6 +305,20 @@ def learning_rate_factor(step: int, schedule: Schedule, warmup_steps: int, max_s
     return 0.5 * (1.0 + math.cos(math.pi * progress))
 
 
+def planned_steps(trainer: pl.Trainer) -> int:
+    """Optimiser steps at the end of a training, -1 for no end: `max_steps`, or fewer where `max_epochs` ends it.
+
+    Asks the data module for a loader apart: `estimated_stepping_batches` builds the training's own and breaks resuming.
+    """
+    datamodule: Any = getattr(trainer, "datamodule", None)
+    if datamodule is None or trainer.max_epochs is None or trainer.max_epochs < 0:
+        return trainer.max_steps
+    batches, limit = len(datamodule.train_dataloader()), trainer.limit_train_batches
+    batches = min(batches, limit) if isinstance(limit, int) else int(batches * limit)
+    steps = trainer.max_epochs * -(-batches // trainer.accumulate_grad_batches)
+    return steps if trainer.max_steps < 0 else min(trainer.max_steps, steps)
+
+
 def adam(
     parameters: Iterable[nn.Parameter | dict[str, Any]],
     lr: float,
@@ -312,10 +326,7 @@ def adam(
     warmup_steps: int,
     module: pl.LightningModule,
 ) -> Any:
-    """Build Adam in the form Lightning expects, over parameters or groups of them with their own rates.
-
-    Reads ``trainer.max_steps`` only: ``estimated_stepping_batches`` builds the loaders early and breaks resuming.
-    """
+    """Build Adam in the form Lightning expects, over parameters or groups of them with their own rates."""
     learning: list[Any] = [p for p in parameters if isinstance(p, dict) or p.requires_grad]
     # One fused kernel instead of ten small operations a tensor: 12.4 ms a policy step instead of 14.5 on two CPU cores.
     tensors = [p for group in learning for p in (group["params"] if isinstance(group, dict) else [group])]
@@ -323,7 +334,7 @@ def adam(
     optimizer = torch.optim.Adam(learning, lr=lr, fused=fused)
     if schedule == "constant" and warmup_steps == 0:
         return optimizer
-    max_steps = module.trainer.max_steps
+    max_steps = planned_steps(module.trainer)
 
     def factor(step: int) -> float:
         return learning_rate_factor(step, schedule, warmup_steps, max_steps)

@@ -3,11 +3,13 @@
 import math
 from types import SimpleNamespace
 
+import lightning.pytorch as pl
 import pytest
 import torch
 from torch import nn
+from torch.utils.data import DataLoader
 
-from dds_lightning.module import adam, learning_rate_factor
+from dds_lightning.module import adam, learning_rate_factor, planned_steps
 
 
 @pytest.mark.parametrize(
@@ -57,3 +59,46 @@ def test_each_group_follows_the_schedule_from_its_own_rate():
         scheduler.step()
     factors = [0.5 * (1 + math.cos(math.pi * step / 4)) for step in range(5)]
     assert rates == [pytest.approx([0.1 * factor, 0.01 * factor]) for factor in factors]
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({"max_steps": 40}, 40),
+        ({"max_steps": 40, "max_epochs": 3}, 12),  # three times four batches
+        ({"max_steps": 10, "max_epochs": 3}, 10),
+        ({"max_steps": -1, "max_epochs": 2}, 8),
+        ({"max_steps": 40, "max_epochs": 3, "limit_train_batches": 2}, 6),
+        ({"max_steps": 40, "max_epochs": 3, "limit_train_batches": 0.5}, 6),
+        ({"max_steps": 40, "max_epochs": 3, "accumulate_grad_batches": 3}, 6),
+        ({"max_steps": -1, "max_epochs": -1}, -1),
+    ],
+)
+def test_a_training_ends_with_its_steps_or_its_epochs_and_the_schedule_with_it(settings, expected):
+    rates = []
+
+    class Net(pl.LightningModule):
+        def __init__(self):
+            super().__init__()
+            self.net = nn.Linear(1, 1)
+
+        def training_step(self, batch, batch_idx):
+            rates.append(self.optimizers().param_groups[0]["lr"])
+            return self.net(batch).sum()
+
+        def configure_optimizers(self):
+            return adam(self.net.parameters(), 0.1, "cosine", 0, self)
+
+    class Data(pl.LightningDataModule):
+        def train_dataloader(self):
+            return DataLoader(torch.ones(4, 1))
+
+    quiet = dict.fromkeys(("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary"), False)
+    trainer = pl.Trainer(accelerator="cpu", **quiet, **settings)
+    data = Data()
+    trainer.datamodule = data  # as `fit` leaves it
+    assert planned_steps(trainer) == expected
+    if expected > 0 and "accumulate_grad_batches" not in settings:
+        trainer.fit(Net(), datamodule=data)
+        assert trainer.global_step == len(rates) == expected
+        assert rates[-1] == pytest.approx(0.1 * learning_rate_factor(expected - 1, "cosine", 0, expected))

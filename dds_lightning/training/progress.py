@@ -10,11 +10,12 @@ import lightning.pytorch as pl
 from lightning.pytorch.callbacks import ProgressBar
 
 from dds_lightning.console.progress import progress_bar
+from dds_lightning.module import planned_steps
 from dds_lightning.saving.run_directory import duration
 
 
 class StepProgress(ProgressBar):
-    """Count optimiser steps towards `max_steps`, across epochs.
+    """Count optimiser steps towards the end of the training, across epochs.
 
     Lightning's bars count the batches of an epoch, but here a training is measured in optimiser steps. On a terminal
     the line is redrawn a few times a second; in a log file a line is written every minute. Metrics are read only
@@ -40,7 +41,7 @@ class StepProgress(ProgressBar):
         self._update: Callable[..., None] | None = None
         self._enabled = True
         self._next = self._started = 0.0
-        self._first_step = 0
+        self._first_step, self._last_step = 0, -1
 
     def disable(self) -> None:
         """Show nothing."""
@@ -53,10 +54,11 @@ class StepProgress(ProgressBar):
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Start counting."""
         self._started, self._first_step = time.monotonic(), trainer.global_step
+        self._last_step = planned_steps(trainer)
         self._next = self._started + (0 if self._terminal else self.log_every_n_seconds)
         if self._enabled and self._terminal and trainer.is_global_zero:
             layout = ("  step", "bar", "count", "remaining", "{task.fields[facts]}")
-            total = trainer.max_steps if trainer.max_steps > 0 else None
+            total = self._last_step if self._last_step > 0 else None
             bar = progress_bar(layout, total, completed=trainer.global_step, facts="")
             self._update = self._bar.enter_context(bar)
 
@@ -74,7 +76,7 @@ class StepProgress(ProgressBar):
             self._update(completed=step, facts=facts)
             self._next = now + 0.3
             return
-        left = f", {duration((trainer.max_steps - step) / max(rate, 1e-9))} left" if trainer.max_steps > 0 else ""
+        left = f", {duration((self._last_step - step) / max(rate, 1e-9))} left" if self._last_step > 0 else ""
         print(f"  step {step:,}{left}  {facts}", file=sys.stderr, flush=True)
         self._next = now + self.log_every_n_seconds
 
