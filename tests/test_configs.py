@@ -128,7 +128,7 @@ def test_a_presets_run_fills_in_what_was_not_asked_for(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("steps: 3", "run.yaml sets steps, expected only data_steps, clone_steps, selection, temperature"),
+        ("steps: 3", "run.yaml sets steps, expected only data_steps, clone_steps, episodes_per_skill, selection"),
         ("data_steps: many", "run.yaml sets data_steps to 'many', expected a value like 200000"),
         ("- 3", "run.yaml is not a mapping"),
         ("selection: [greedy", "run.yaml is not valid YAML: while parsing a flow sequence"),

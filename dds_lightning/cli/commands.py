@@ -26,7 +26,7 @@ def run(
     clone_steps: int | None = None,
     evaluate_every: int | None = None,
     episodes: int | None = None,
-    episodes_per_skill: int = 20,
+    episodes_per_skill: int | None = None,
     selection: Literal["sample", "greedy", "argmax_q"] | None = None,
     temperature: float | None = None,
     noise_scale: float | None = None,
@@ -60,9 +60,9 @@ def run(
             environment.
         seed: Seed of everything random: data, both trainings and the evaluation.
         preset: Packaged configurations (antmaze, kitchen, locomotion, pointmaze, paper), or a folder with skill.yaml,
-            policy.yaml and, if you like, run.yaml (data_steps, clone_steps, selection, temperature, noise_scale);
-            without it the task family's.
-        data_steps: Environment steps to collect; without it the preset's, as for clone_steps, selection, temperature.
+            policy.yaml and, if you like, run.yaml (data_steps, clone_steps, episodes_per_skill, selection, temperature,
+            noise_scale); without it the task family's.
+        data_steps: Environment steps to collect; without it the preset's, as for the other settings of run.yaml.
         clone_steps: Optimiser steps of the behaviour-cloning baseline.
         evaluate_every: Steps between two evaluations of 10 episodes while the policy trains; the best checkpoint by
             their score is reported beside the last; 0 for none; without it a quarter of the training, on PointMaze

@@ -11,6 +11,7 @@ ROOT = Path(__file__).parent
 RUN_DEFAULTS: dict[str, Any] = {
     "data_steps": 200_000,
     "clone_steps": 16_000,
+    "episodes_per_skill": 20,
     "selection": "greedy",  # on average of all agents shipped and tried, 4 to 5 points above sampling
     "temperature": 1.0,
     "noise_scale": None,  # the skill model's

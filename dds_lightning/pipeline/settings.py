@@ -38,7 +38,7 @@ class RunSettings:
     clone_steps: int = RUN_DEFAULTS["clone_steps"]
     evaluate_every: int | None = None
     episodes: int | None = None
-    episodes_per_skill: int = 20
+    episodes_per_skill: int = RUN_DEFAULTS["episodes_per_skill"]
     selection: str = RUN_DEFAULTS["selection"]
     temperature: float = RUN_DEFAULTS["temperature"]
     noise_scale: float | None = RUN_DEFAULTS["noise_scale"]
@@ -70,7 +70,7 @@ class RunSettings:
         """The command line that makes the same run again, `--out` aside."""
         usual = RunSettings.with_preset(self.task, self.out, self.preset)
         arguments = ["dds", "run", self.task, f"--seed={self.seed}"]
-        for name in ("data", "preset", *RUN_DEFAULTS, "evaluate_every", "episodes", "episodes_per_skill"):
+        for name in ("data", "preset", *RUN_DEFAULTS, "evaluate_every", "episodes"):
             value = getattr(self, name)
             if value != getattr(usual, name) or (name == "preset" and value):
                 arguments.append(f"--{name}={value}")

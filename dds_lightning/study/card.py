@@ -138,4 +138,6 @@ def _provenance(source: str, task: Task) -> str:
 
 def _training(stage: str, chosen: Mapping[str, Any]) -> str:
     model = ", ".join(f"{name} {value}" for name, value in chosen["model"].items() if not name.endswith("_dim"))
-    return f"- {stage}: {chosen['trainer']['max_steps']:,} steps, batches of {chosen['data']['batch_size']}; {model}"
+    trainer, passes = chosen["trainer"], chosen["trainer"].get("max_epochs") or -1
+    limit = f" or {passes} passes over the data, what comes first" if passes > 0 else ""
+    return f"- {stage}: {trainer['max_steps']:,} steps{limit}, batches of {chosen['data']['batch_size']}; {model}"
