@@ -16,8 +16,8 @@ class CompiledLoss(Callback):
     """Compile the module's loss, forward and backward, with `torch.compile`; networks and checkpoints stay as they are.
 
     Operations between matrix products are fused, so rounding differs a little from a training without it. Worth it for
-    small networks in bfloat16 (`benchmarks/LOG.md`), and on a GPU, where mode ``reduce-overhead`` replays a step as
-    CUDA graphs. The first step takes up to a minute.
+    small networks in bfloat16 (`benchmarks/LOG.md`), and made for GPUs, where mode ``reduce-overhead`` replays a step
+    as CUDA graphs. The first step takes up to a minute.
 
     Args:
         mode: Of `torch.compile`; the last three take minutes to try out kernels, or need a GPU.
@@ -38,7 +38,8 @@ class CompiledLoss(Callback):
             UserError: There is no compiler for the processor's code.
         """
         own: Any = pl_module.loss
-        if self.backend == "inductor" and pl_module.device.type == "cpu" and not any(map(shutil.which, COMPILERS)):
+        on_cpu = trainer.strategy.root_device.type == "cpu"
+        if self.backend == "inductor" and on_cpu and not any(map(shutil.which, COMPILERS)):
             raise UserError(
                 "compiled loss: on a CPU it needs a C++ compiler (g++ or clang++), and none was found: install one, "
                 "or train without this callback"
