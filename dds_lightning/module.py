@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Literal, Self
 
 import lightning.pytorch as pl
 import torch
+from lightning.fabric.utilities.data import sized_len
 from torch import Tensor, nn
 
 from dds_lightning.errors import UserError
@@ -306,16 +307,15 @@ def learning_rate_factor(step: int, schedule: Schedule, warmup_steps: int, max_s
 
 
 def planned_steps(trainer: pl.Trainer) -> int:
-    """Optimiser steps at the end of a training, -1 for no end: `max_steps`, or fewer where `max_epochs` ends it.
-
-    Asks the data module for a loader apart: `estimated_stepping_batches` builds the training's own and breaks resuming.
-    """
+    """Optimiser steps at the end of a training, -1 for no end: `max_steps`, or fewer where `max_epochs` ends it."""
     datamodule: Any = getattr(trainer, "datamodule", None)
-    if datamodule is None or trainer.max_epochs is None or trainer.max_epochs < 0:
+    epochs = getattr(trainer, "max_epochs", None) or -1
+    # A loader apart: `estimated_stepping_batches` builds the training's own and breaks resuming.
+    batches = sized_len(datamodule.train_dataloader()) if datamodule is not None and epochs > 0 else None
+    if batches is None:
         return trainer.max_steps
-    batches, limit = len(datamodule.train_dataloader()), trainer.limit_train_batches
-    batches = min(batches, limit) if isinstance(limit, int) else int(batches * limit)
-    steps = trainer.max_epochs * -(-batches // trainer.accumulate_grad_batches)
+    batches = min(batches, limit) if isinstance(limit := trainer.limit_train_batches, int) else int(batches * limit)
+    steps = epochs * -(-batches // trainer.accumulate_grad_batches)
     return steps if trainer.max_steps < 0 else min(trainer.max_steps, steps)
 
 

@@ -8,13 +8,14 @@ import torch
 from dds_lightning.saving.checkpoint import AtomicCheckpointIO
 
 
-def fit(module, data, steps, ckpt_path=None) -> pl.Trainer:
+def fit(module, data, steps, ckpt_path=None, callbacks=()) -> pl.Trainer:
     """Train for some steps without anything that writes or prints; `ckpt_path` resumes."""
     trainer = pl.Trainer(
         max_steps=steps,
         logger=False,
         accelerator="cpu",
         plugins=[AtomicCheckpointIO()],
+        callbacks=list(callbacks),
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,

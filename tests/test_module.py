@@ -7,7 +7,7 @@ import lightning.pytorch as pl
 import pytest
 import torch
 from torch import nn
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, IterableDataset
 
 from dds_lightning.module import adam, learning_rate_factor, planned_steps
 
@@ -102,3 +102,13 @@ def test_a_training_ends_with_its_steps_or_its_epochs_and_the_schedule_with_it(s
         trainer.fit(Net(), datamodule=data)
         assert trainer.global_step == len(rates) == expected
         assert rates[-1] == pytest.approx(0.1 * learning_rate_factor(expected - 1, "cosine", 0, expected))
+
+
+def test_a_loader_that_does_not_know_its_length_leaves_the_end_to_the_steps():
+    class Endless(IterableDataset):
+        def __iter__(self):
+            return iter(lambda: torch.ones(1), None)
+
+    trainer = pl.Trainer(max_steps=7, max_epochs=3, accelerator="cpu", logger=False, enable_checkpointing=False)
+    trainer.datamodule = pl.LightningDataModule.from_datasets(train_dataset=Endless())
+    assert planned_steps(trainer) == 7

@@ -10,6 +10,7 @@ from dds_lightning.baselines.behaviour_cloning import BehaviourCloning
 from dds_lightning.callbacks import CompiledLoss, FiniteGuard
 from dds_lightning.errors import UserError
 from dds_lightning.online.sac import SACModule
+from tests.modules import fit
 
 ROWS = 8
 
@@ -68,16 +69,7 @@ def train(make, data, *more: pl.Callback) -> pl.LightningModule:
     module.normaliser.fit(torch.zeros(3), torch.ones(3))
     if hasattr(module, "action_box") and module.action_box.low.numel():
         module.action_box.fit(-torch.ones(2), torch.ones(2))
-    trainer = pl.Trainer(
-        max_steps=4,
-        accelerator="cpu",
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        callbacks=[FiniteGuard(), *more],
-    )
-    trainer.fit(module, DataLoader(data(), batch_size=ROWS))
+    fit(module, DataLoader(data(), batch_size=ROWS), 4, callbacks=[FiniteGuard(), *more])
     return module
 
 
