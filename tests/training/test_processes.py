@@ -143,6 +143,28 @@ def test_the_processes_of_a_training_have_one_precision(monkeypatch):
     assert settled("bf16-mixed") == "32-true"
 
 
+LEAVE = """
+import atexit, sys, torch
+from dds_lightning.__main__ import leave
+class Kept:
+    def __del__(self):
+        sys.__stdout__.write("taken down")
+kept = Kept()
+if sys.argv[1] == "several":
+    torch.distributed.init_process_group("gloo", rank=0, world_size=1, store=torch.distributed.HashStore())
+atexit.register(print, "sent")
+print("told")
+leave(3)
+"""
+
+
+@pytest.mark.parametrize(("processes", "said"), [("one", "told sent taken down"), ("several", "told sent")])
+def test_one_of_several_processes_leaves_before_python_is_taken_down(processes, said):
+    """Its story: a thread of Gloo released a tensor too late, and a finished training ended with status -6."""
+    ran = subprocess.run([sys.executable, "-c", LEAVE, processes], capture_output=True, text=True, check=False)
+    assert (ran.returncode, ran.stdout.split()) == (3, said.split())
+
+
 def dds(*words):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "dds_lightning", *words]
