@@ -103,6 +103,7 @@ IDEAS = {
     "width 192": Idea({"hidden_dim": 192, "encoder_heads": 6}),
     "1 encoder layer": Idea({"encoder_layers": 1}),
     "1 encoder layer, lr 1e-3": Idea({"encoder_layers": 1, "lr": 1e-3}),
+    "1 encoder layer, lr 2e-3": Idea({"encoder_layers": 1, "lr": 2e-3}),
     "2 decoder blocks": Idea({"decoder_blocks": 2}),
     "decoder alone after half": Idea(frozen_after=0.5),
     "muon": Idea(optimisers=muon),

@@ -15,7 +15,7 @@ from dds_lightning.grid.nodes import arguments
 from dds_lightning.rollout.actors import Contestant
 from dds_lightning.rollout.play import rollout
 from dds_lightning.saving.run_directory import Done
-from dds_lightning.study.protocol import BEST, LAST, best_facts
+from dds_lightning.study.protocol import BEST, LAST, trained
 from dds_lightning.tasks import get_task
 from dds_lightning.training.stage_cli import command
 from dds_lightning.training.stages import STAGES
@@ -65,13 +65,9 @@ def train(settings: Facts, how: Facts, reads: Reads, folder: Path, resuming: boo
     last = folder / "last.ckpt"
     resume = [f"--ckpt_path={last}"] if resuming and last.is_file() else []
     fitted = command(stage, [*words, *resume])().data
-    made: dict[str, Any] = {name: Path(fitted[name]) for name in ("checkpoint", "best") if fitted[name]}
-    if "best" in made:
-        made["chosen"] = best_facts(made["checkpoint"], made["best"])
-        if "watch" not in settings:  # the preset itself keeps the best, by a loss
-            made["checkpoint"] = made.pop("best")
-    metrics = {name: round(value, 6) for name, value in fitted["metrics"].items()}
-    return {**made, "steps": fitted["steps"], "metrics": metrics, "command": shlex.join(["dds", stage, *words])}
+    # Where nobody watches in the environment, the preset itself keeps the best, by a loss.
+    made = trained(fitted, takes_best="watch" not in settings)
+    return {**made, "command": shlex.join(["dds", stage, *words])}
 
 
 def evaluate(settings: Facts, how: Facts, reads: Reads, folder: Path, resuming: bool) -> Facts:

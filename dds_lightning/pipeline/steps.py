@@ -138,19 +138,14 @@ def _fit(stage: str, best: str, publish: bool, run: Run, folder: Path, resuming:
     resume = last if resuming and last.is_file() else None
     run.say(run.trainings.command(stage, run.data_spec, skill, resume), style="dim")
     fitted = run.trainings.fit(stage, run.data_spec, skill, resume).data
-    made: dict[str, Any] = {name: Path(fitted[name]) for name in ("checkpoint", "best") if fitted[name]}
-    if "best" in made and best == "replaces":
-        made["checkpoint"] = made.pop("best")
-    elif "best" in made:
-        made["chosen"] = protocol.best_facts(made["checkpoint"], made["best"])
-    metrics = {name: round(value, 6) for name, value in fitted["metrics"].items()}
+    made = protocol.trained(fitted, takes_best=best == "replaces")
     if publish:
         from dds_lightning.agent import DDSAgent
         from dds_lightning.online.parts import checkpoint_parts
 
         agent = DDSAgent(*checkpoint_parts(str(skill), str(made["checkpoint"])), seed=run.wanted.seed)
         made["agent"] = agent.save(folder / "agent", **facts_to_keep(run.task))
-    return {**made, "steps": fitted["steps"], "metrics": metrics}
+    return made
 
 
 def _relabel(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:

@@ -110,22 +110,28 @@ def policy_evidence(data: RelabeledDataModule, policy: PolicyModule) -> dict[str
     rank = float(spearmanr(values, returns[data.transitions.starts[index].numpy()]).statistic)
     found = {"critic_rank": 0.0 if np.isnan(rank) else rank}
     if policy.hparams.awr == "closed_form":
-        found["policy_shift"] = policy_shift(policy, states)
+        states = states.to(policy.device)
+        beta = policy.actor(policy.embed(states))
+        found["policy_shift"] = policy_shift(policy, states, beta)
         if len(data.validation_index):
             codes, shares = data.transitions.codes[index], data.statistics()["code_share"]
-            beta = policy.actor(policy.embed(states.to(policy.device))).cpu()
-            found["beta_loss"] = float(cross_entropy(beta, codes))
+            found["beta_loss"] = float(cross_entropy(beta.cpu(), codes))
             found["share_loss"] = float(cross_entropy(shares.clamp_min(1e-6).log().expand(len(codes), -1), codes))
     return found
 
 
 @torch.inference_mode()
-def policy_shift(policy: PolicyModule, observations: torch.Tensor) -> float:
-    """KL(pi || beta) over states (N, O), as a share of the KL of always taking the likeliest code of pi."""
-    observations = observations.to(policy.device)
+def policy_shift(policy: PolicyModule, observations: torch.Tensor, beta: torch.Tensor) -> float:
+    """KL(pi || beta) over states, as a share of the KL of always taking the likeliest code of pi.
+
+    Args:
+        policy: Gives pi.
+        observations: (N, O).
+        beta: (N, K) logits of the policy of the data there.
+    """
     log_pi = policy.logits(observations).log_softmax(dim=-1)
     allowed = log_pi.isfinite()
-    beta = policy.actor(policy.embed(observations)).masked_fill(~allowed, -torch.inf).log_softmax(dim=-1)
-    moved = torch.where(allowed, log_pi.exp() * (log_pi - beta), 0.0).sum(dim=-1).mean()
-    most = -beta.gather(1, log_pi.argmax(dim=-1, keepdim=True)).mean()
+    log_beta = beta.masked_fill(~allowed, -torch.inf).log_softmax(dim=-1)
+    moved = torch.where(allowed, log_pi.exp() * (log_pi - log_beta), 0.0).sum(dim=-1).mean()
+    most = -log_beta.gather(1, log_pi.argmax(dim=-1, keepdim=True)).mean()
     return float(moved / most.clamp_min(1e-6))

@@ -121,6 +121,26 @@ def best_facts(last: Path, best: Path) -> dict[str, Any]:
         }
 
 
+def trained(fitted: Mapping[str, Any], takes_best: bool) -> dict[str, Any]:
+    """Return what `dds STAGE fit` left, as the facts that a finished step or node of a study keeps.
+
+    Args:
+        fitted: Its report.
+        takes_best: Whether what follows goes on with the best checkpoint, where one was kept, in place of the last.
+
+    Returns:
+        `checkpoint`, `steps` and `metrics`; where a best was kept, how it was `chosen`, see `best_facts`; and `best`
+        itself, unless it takes the last one's place.
+    """
+    made: dict[str, Any] = {name: Path(fitted[name]) for name in ("checkpoint", "best") if fitted[name]}
+    if "best" in made:
+        made["chosen"] = best_facts(made["checkpoint"], made["best"])
+        if takes_best:
+            made["checkpoint"] = made.pop("best")
+    metrics = {name: round(value, 6) for name, value in fitted["metrics"].items()}
+    return {**made, "steps": fitted["steps"], "metrics": metrics}
+
+
 def start_value(task: Task, agent: DDSAgent, seed: int, episodes: int = 10) -> dict[str, float] | None:
     """Return the critic's value at the starts of episodes, in discounted learning rewards.
 

@@ -88,7 +88,7 @@ def test_the_shift_runs_from_the_datas_policy_to_the_critics_best_code():
     shifts = []
     for alpha in (0.0, 1.0, 10.0, 1e4):
         policy.hparams.alpha = alpha
-        shifts.append(policy_shift(policy, states))
+        shifts.append(policy_shift(policy, states, policy.actor(policy.embed(states))))
     assert shifts[0] == pytest.approx(0.0, abs=1e-6)
     assert shifts == sorted(shifts)
     assert shifts[-1] == pytest.approx(1.0, abs=0.02)
