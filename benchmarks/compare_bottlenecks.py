@@ -22,7 +22,7 @@ from rich.console import Console
 from dds_lightning.console.reports import table as text_table
 from dds_lightning.interpret import plot_comparison, png_bytes, small_png
 from dds_lightning.interpret.atlas.build import CONTINUOUS, DISCRETE
-from dds_lightning.saving.run_directory import Done, Stages
+from dds_lightning.saving.run_directory import Done, RunDirectory
 from dds_lightning.tasks import Task, get_task
 
 DIM = 64
@@ -36,6 +36,7 @@ MEASURES = (
     ("own_control", "  the same, another code held, %", 100.0),
     ("accuracy", "recovered from any state, %", 100.0),
     ("chance", "  chance, %", 100.0),
+    ("told_by_state", "told by the first state of a segment, %", 100.0),
     ("information_in_state", "bits between code and displacement, in a state", 1.0),
     ("information", "bits between code and displacement, over all", 1.0),
     ("most", "  possible", 1.0),
@@ -45,7 +46,7 @@ MEASURES = (
 """Columns of `compare_recovery`, their names in the table, and a factor."""
 
 
-def data_of(stages: Stages, task: Task, data: str | None) -> tuple[str, list[Done]]:
+def data_of(stages: RunDirectory, task: Task, data: str | None) -> tuple[str, list[Done]]:
     """The given data, or newly collected data, as SOURCE:NAME."""
     if data is not None:
         return data, []
@@ -59,7 +60,7 @@ def data_of(stages: Stages, task: Task, data: str | None) -> tuple[str, list[Don
     return f"local:{done.outputs['data']}", [done]
 
 
-def train(stages: Stages, name: str, task: Task, spec: str, reads: list[Done], settings: list[str], steps: int) -> Path:
+def train(stages: RunDirectory, name: str, task: Task, spec: str, reads: list[Done], settings: list[str], steps: int) -> Path:
     """Train one model, unless that is already done; return its checkpoint."""
     from dds_lightning.training.stage_cli import StageCLI, quieten
 
@@ -118,7 +119,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/bottlenecks"))
     arguments = parser.parse_args()
     task, console = get_task(arguments.task), Console(stderr=True)
-    stages = Stages(arguments.out, console)
+    stages = RunDirectory(arguments.out, console)
     spec, reads = data_of(stages, task, arguments.data)
     parts = []
     for seed in range(arguments.seeds):

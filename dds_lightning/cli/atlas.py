@@ -75,6 +75,7 @@ def atlas(
         ),
         ("recovered", f"{100 * found.accuracy:.1f} % of replays from any state"),
         ("chance", f"{100 * found.chance:.1f} %"),
+        ("told by the state", f"the code of {100 * trip.state:.1f} % of the data's segments, by where they begin"),
         ("about where it leads", f"{found.information_in_state:.2f} bits in a state, at most {found.most:.2f}"),
         ("page", f"{path} ({path.stat().st_size / 1e6:.1f} MB)"),
     ]

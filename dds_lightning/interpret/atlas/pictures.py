@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -233,6 +234,10 @@ class AtlasPictures:
     ) -> None:
         """Draw the matrices between codes, and where each code is used."""
         count = len(recovery.codes)
+        told = ""
+        if not math.isnan(trip.state):
+            told = f"In the data, {trip.state:.0%} of the segments have the code of those that begin most like them: "
+            told += "the nearer to all, the less a code is a choice."
         self.keep(
             "trip",
             charts.plot_round_trip(trip),
@@ -244,7 +249,7 @@ class AtlasPictures:
             "recovery",
             charts.plot_recovery(recovery),
             f"Recovery: {count} codes, each held for {recovery.steps} steps from the same {recovery.states} states, "
-            "drawn from all of the data. Equal rows mean that the state decides, not the code.",
+            "drawn from all of the data. Equal rows mean that the state decides, not the code. " + told,
             f"Confusion matrix of {count} codes: {recovery.accuracy:.0%} recovered, chance {recovery.chance:.0%}.",
         )
         self.keep(

@@ -159,7 +159,7 @@ def compare_recovery(
 
     Returns:
         One row per model: `model`, `seed` (counted within its name), `kind` ("discrete" or "continuous"), the facts of
-        `recovery.Recovery`, `own_accuracy` and `own_control` from `recovery.round_trip`, `decoded`, the
+        `recovery.Recovery`, `own_accuracy`, `own_control` and `told_by_state` of `recovery.RoundTrip`, `decoded`, the
         `decoding_error` under codes, and `decoded_own`, that under each segment's vector (NaN for discrete skills,
         which have none).
 
@@ -182,7 +182,7 @@ def compare_recovery(
             found, _ = code_recovery(task, skills, drawn, seed=seed, env=env)
             trip = round_trip(task, skills, trajectories, states, seed=seed, env=env)
             number = sum(row["model"] == name for row in rows)
-            shares = {"own_accuracy": trip.accuracy, "own_control": trip.control}
+            shares = {"own_accuracy": trip.accuracy, "own_control": trip.control, "told_by_state": trip.state}
             errors = {
                 "decoded": decoding_error(skills, trajectories, seed=seed),
                 "decoded_own": math.nan if model.discrete else decoding_error(model, trajectories, seed=seed),

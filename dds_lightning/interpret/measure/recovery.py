@@ -11,6 +11,10 @@ The round trip uses states in which the data use the code. There the state alone
 codes are often phases of its gait). The control measures this: the effect of the code itself is accuracy minus control.
 Recovery plays every code from the same states, so a state gives nothing away. It is the harder test: a decoder need not
 follow a code in states where the data never use it. Chance is 1 / K in both, because codes are played equally often.
+
+Where little is recovered, look at how often a segment's first state tells its code (`RoundTrip.state`). Where it nearly
+always does, the data do the same thing in the same state, and codes name parts of one movement: there is no other
+behaviour in that state that a decoder could have learnt.
 """
 
 from __future__ import annotations
@@ -24,6 +28,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from datamodules.trajectories import Trajectories
 from dds_lightning.interpret.measure.body import root_path, to_body
@@ -34,6 +39,9 @@ from dds_lightning.tasks import Task
 
 POOL = 4000
 """Number of segments of the data from which those of a round trip are drawn."""
+
+NEIGHBOURS = 5
+"""Most similar first states that vote for a segment's code."""
 
 Floats = NDArray[np.float64]
 
@@ -141,6 +149,7 @@ class RoundTrip:
         error: Its standard error, over segments.
         control: Share of the replays of another code, from the same states, that are taken for the code of the data:
             how much the state alone gives it away.
+        state: Share of segments of the data whose code their first state tells, see `told_by_state`.
         chance: 1 / C.
         segments: Number of segments of the data for each code.
     """
@@ -151,12 +160,13 @@ class RoundTrip:
     accuracy: float
     error: float
     control: float
+    state: float
     chance: float
     segments: int
 
     def facts(self) -> dict[str, Any]:
         """The numbers, for a table or for JSON."""
-        names = ("accuracy", "error", "control", "chance", "segments")
+        names = ("accuracy", "error", "control", "state", "chance", "segments")
         return {"codes": len(self.codes), **{name: getattr(self, name) for name in names}}
 
 
@@ -205,7 +215,29 @@ def round_trip(
     by_code = np.diag(confusion).copy()
     error = float(hits.std(ddof=1) / math.sqrt(len(hits))) if len(hits) > 1 else math.nan
     control = float((instead == held)[other != held].mean()) if len(chosen) > 1 else math.nan
-    return RoundTrip(chosen, confusion, by_code, float(hits.mean()), error, control, 1 / len(chosen), segments)
+    state = told_by_state(seen[:, 0], codes, windows.episodes[pool])
+    return RoundTrip(chosen, confusion, by_code, float(hits.mean()), error, control, state, 1 / len(chosen), segments)
+
+
+def told_by_state(states: NDArray[Any], codes: NDArray[Any], episodes: NDArray[Any]) -> float:
+    """Return the share of segments whose code is the commonest among the most similar states of other episodes.
+
+    Args:
+        states: (M, O) first states of segments; distances count every entry in its standard deviation.
+        codes: (M,).
+        episodes: (M,) the episode of each.
+
+    Returns:
+        The share; NaN where a segment has fewer than `NEIGHBOURS` in other episodes.
+    """
+    scaled = (states - states.mean(axis=0)) / np.maximum(states.std(axis=0), 1e-6)
+    apart = cdist(scaled, scaled)
+    apart[episodes[:, None] == episodes] = np.inf
+    nearest = np.argsort(apart, axis=1, kind="stable")[:, :NEIGHBOURS]  # (M, N)
+    if not np.isfinite(np.take_along_axis(apart, nearest, axis=1)).all():
+        return math.nan
+    votes = (codes[nearest][:, :, None] == np.arange(codes.max() + 1)).sum(axis=1)  # (M, K)
+    return float((votes.argmax(axis=1) == codes).mean())
 
 
 def encode_replays(skills: Skills, replays: Replays) -> NDArray[np.int64]:

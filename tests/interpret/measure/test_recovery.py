@@ -8,7 +8,13 @@ from dds_lightning.errors import UserError
 from dds_lightning.interpret.draw.charts import plot_comparison, plot_effects, plot_recovery, plot_round_trip
 from dds_lightning.interpret.measure.comparison import cluster_skills, compare_recovery, decoding_error
 from dds_lightning.interpret.measure.information import mutual_information
-from dds_lightning.interpret.measure.recovery import code_recovery, displacements, encode_replays, round_trip
+from dds_lightning.interpret.measure.recovery import (
+    code_recovery,
+    displacements,
+    encode_replays,
+    round_trip,
+    told_by_state,
+)
 from dds_lightning.interpret.measure.replay import Replays, simulator
 from dds_lightning.interpret.measure.states import rest_states
 from dds_lightning.tasks import get_task
@@ -62,6 +68,21 @@ def test_codes_out_of_use_are_left_out_and_chance_is_that_of_the_rest(env, state
     assert found.codes.tolist() == [1, 3]
     assert (found.accuracy, found.chance, found.most) == (0.0, 0.5, 1.0)
     np.testing.assert_array_equal(found.confusion, [[0, 0], [0, 0]])  # all are taken for code 0, which is not there
+
+
+@pytest.mark.parametrize(("decides", "share"), [(1.0, 1.0), (0.0, 0.25)])
+def test_how_much_of_its_code_the_first_state_of_a_segment_tells(decides, share):
+    rng = np.random.default_rng(0)
+    codes, episodes = rng.integers(0, 4, 2000), np.arange(2000) % 10
+    states = np.stack([100 * (decides * codes + 0.01 * rng.normal(size=2000)), rng.normal(size=2000)], axis=1)
+    assert told_by_state(states, codes, episodes) == pytest.approx(share, abs=0.05)
+
+
+def test_states_of_a_segments_own_episode_tell_nothing():
+    """Segments overlap: the next one begins a step later and has nearly always the same code."""
+    states, codes = np.arange(12.0)[:, None], np.repeat([0, 1], 6)
+    assert told_by_state(states, codes, np.repeat([0, 1], 6)) == 0.0
+    assert np.isnan(told_by_state(states, codes, np.zeros(12)))
 
 
 def test_a_replay_that_ended_early_is_encoded_as_short():
