@@ -64,7 +64,7 @@ ROOMS = {
     "datamodules.online": "errors online skill tasks datamodules.relabel datamodules.relabelled "
     "datamodules.relabelling",
     # training
-    "dds_lightning.callbacks": "agent console envs errors online policy rollout skill tasks",
+    "dds_lightning.callbacks": "agent console envs errors module online policy rollout skill tasks",
     "dds_lightning.training": "callbacks configs console errors finetune module nn saving tasks",
     "dds_lightning.baselines": "agent errors losses module nn online policy rollout saving skill tasks training",
     # what came of it

@@ -10,6 +10,7 @@ import numpy as np
 from lightning.pytorch.callbacks import Callback
 
 from dds_lightning.errors import UserError
+from dds_lightning.module import planned_steps
 
 
 class Convergence(Callback):
@@ -18,16 +19,19 @@ class Convergence(Callback):
     After each validation a line is fitted to log(loss) over log(step), from half of the steps so far to now: learning
     curves are nearly straight there, and the line says by how much the loss would fall with a quarter more steps. When
     that is less than `tolerance`, the training is done. Let the weights be averaged (`average.decay`) and the learning
-    rate constant: a curve that is flat because the learning rate has decayed proves nothing.
+    rate constant until then: a curve that is flat because the learning rate has decayed proves nothing.
 
     Args:
         when: ``converged`` stops as described, ``steps`` at `max_steps` alone.
         monitor: The metric, logged at validations.
         min_steps: Steps before which a training never stops.
         tolerance: Relative fall of the loss for a quarter more steps that is still worth them.
+        decay: Steps at the end over which the learning rate falls to zero, in a straight line; 0 for none. A training
+            that is continued later goes on at the full rate.
 
     Attributes:
-        history: (step, loss) of every validation.
+        history: (step, loss) of every validation at the full learning rate.
+        ends: Step at which a training ends that has levelled off; None until then.
 
     Raises:
         UserError: A setting outside its range, or a metric that is not logged.
@@ -44,16 +48,62 @@ class Convergence(Callback):
         monitor: str = "val/loss",
         min_steps: int = 1000,
         tolerance: float = 0.03,
+        decay: int = 0,
     ) -> None:
         if min_steps < 0:
             raise UserError(f"stop.min_steps is {min_steps}, expected 0 or more")
         if not 0.0 < tolerance < 1.0:
             raise UserError(f"stop.tolerance is {tolerance}, expected a share in (0, 1)")
+        if decay < 0:
+            raise UserError(f"stop.decay is {decay}, expected 0 or more steps")
         self.when, self.monitor, self.min_steps, self.tolerance = when, monitor, min_steps, tolerance
+        self.decay = decay
         self.history: list[tuple[int, float]] = []
+        self.ends: int | None = None
+        self._budget = -1  # steps at which the training ends in any case, -1 for no end
+        self._rates: list[float] | None = None  # full learning rates, while they are lowered
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Look when the training ends, and go on where a former one had ended.
+
+        Raises:
+            UserError: The learning rate has a schedule of its own.
+        """
+        schedule = pl_module.hparams.get("lr_schedule", "constant")
+        if self.decay and schedule != "constant":
+            raise UserError(
+                f"stop.decay is {self.decay} and model.lr_schedule is {schedule}, expected constant: a rate can be "
+                "lowered at the end in one way only; set --stop.decay=0 or --model.lr_schedule=constant"
+            )
+        self._budget = planned_steps(trainer)
+        if self.ends is not None and trainer.global_step >= self.ends:
+            self.ends = None
+
+    def on_train_batch_start(self, trainer: pl.Trainer, *_: Any) -> None:
+        """Lower the learning rate of the step that comes, or give back the full one in a training that goes on."""
+        share = self._share(trainer.global_step)
+        if share == 1.0 and self._rates is None:
+            return
+        groups = trainer.optimizers[0].param_groups
+        if self._rates is None:
+            self._rates = [float(group["lr"]) for group in groups]
+        for group, rate in zip(groups, self._rates, strict=True):
+            group["lr"] = rate * share
+        if share == 1.0:
+            self._rates = None
+
+    def _share(self, step: int) -> float:
+        """Share of the full learning rate at a step."""
+        end = self._budget if self.ends is None else self.ends
+        return 1.0 if end < 0 or not self.decay else min(1.0, max(0.0, (end - step) / self.decay))
+
+    def on_train_batch_end(self, trainer: pl.Trainer, *_: Any) -> None:
+        """Stop when the learning rate has come down."""
+        if self.ends is not None and trainer.global_step >= self.ends:
+            trainer.should_stop = True
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Note the loss, and stop if it has levelled off."""
+        """Note the loss, and begin to stop if it has levelled off."""
         if trainer.sanity_checking or trainer.state.fn != "fit":
             return
         if self.monitor not in trainer.callback_metrics:
@@ -61,9 +111,13 @@ class Convergence(Callback):
                 return
             logged = ", ".join(sorted(trainer.callback_metrics))
             raise UserError(f"stop.monitor is {self.monitor}, which is not logged; expected one of {logged}")
-        self.history.append((trainer.global_step, float(trainer.callback_metrics[self.monitor])))
+        step = trainer.global_step
+        if self._share(step) < 1.0:
+            return
+        self.history.append((step, float(trainer.callback_metrics[self.monitor])))
         if self.when == "converged" and self.converged:
-            trainer.should_stop = True
+            self.ends = step + self.decay if self._budget < 0 else min(step + self.decay, self._budget)
+            trainer.should_stop = self.ends <= step
 
     @property
     def converged(self) -> bool:
@@ -82,12 +136,15 @@ class Convergence(Callback):
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """The curve so far."""
-        return {"history": [list(point) for point in self.history]}
+        """The curve so far, and the end that is near."""
+        return {"history": [list(point) for point in self.history], "ends": self.ends, "rates": self._rates}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on from `state_dict`."""
         self.history = [(int(step), float(loss)) for step, loss in state_dict["history"]]
+        ends, rates = state_dict.get("ends"), state_dict.get("rates")
+        self.ends = None if ends is None else int(ends)
+        self._rates = None if rates is None else [float(rate) for rate in rates]
 
 
 def expected_fall(history: list[tuple[int, float]], more: float = 1.25, fewest: int = 5) -> float:

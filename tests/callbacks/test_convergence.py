@@ -9,7 +9,9 @@ import pytest
 import torch
 
 from dds_lightning.callbacks.convergence import Convergence, expected_fall
+from dds_lightning.callbacks.rolling import RollingCheckpoint
 from dds_lightning.errors import UserError
+from dds_lightning.training.trainer import trainer_settings
 
 STEPS = np.arange(500, 20_001, 500)
 
@@ -95,7 +97,92 @@ def test_a_metric_that_nobody_logs_is_named_beside_those_that_are():
         Convergence("converged", monitor="val_loss").on_validation_end(trainer, pl.LightningModule())
 
 
-@pytest.mark.parametrize(("setting", "value"), [("min_steps", -1), ("tolerance", 0.0), ("tolerance", 1.0)])
+class Level(pl.LightningModule):
+    """One weight whose held-out loss is always 1; it notes the learning rate of every step."""
+
+    def __init__(self, lr_schedule="constant"):
+        super().__init__()
+        self.save_hyperparameters()
+        self.weight, self.rates = torch.nn.Parameter(torch.zeros(1)), []
+
+    def training_step(self, batch, batch_idx):
+        self.rates.append(self.optimizers().param_groups[0]["lr"])
+        return self.weight.sum()
+
+    def validation_step(self, batch, batch_idx):
+        self.log("val/loss", torch.tensor(1.0))
+
+    def configure_optimizers(self):
+        return torch.optim.Adam(self.parameters(), lr=1.0)
+
+    def train_dataloader(self):
+        return torch.utils.data.DataLoader(torch.zeros(1000), batch_size=1)
+
+    val_dataloader = train_dataloader
+
+
+class Keep(pl.Callback):
+    """A checkpoint of step 11."""
+
+    def __init__(self, folder):
+        self.folder = folder
+
+    def on_train_batch_end(self, trainer, *_):
+        if trainer.global_step == 11:
+            trainer.save_checkpoint(self.folder / "step-11.ckpt")
+
+
+def rates(folder, steps, resume=None, **settings):
+    """The learning rates of a training that validates every 10 steps, and its callback."""
+    module, stop = Level(), Convergence(decay=4, **settings)
+    base = {"max_steps": steps, "max_epochs": -1, "accelerator": "cpu", "logger": False, "limit_val_batches": 1}
+    base |= {"enable_progress_bar": False, "enable_model_summary": False, "num_sanity_val_steps": 0}
+    base |= {"val_check_interval": 10, "check_val_every_n_epoch": None}
+    trainer = pl.Trainer(**trainer_settings(base, [RollingCheckpoint(str(folder)), stop, Keep(folder)]))
+    trainer.fit(module, ckpt_path=folder / resume if resume else None, weights_only=True)
+    return module.rates, stop
+
+
+DOWN = [1.0, 0.75, 0.5, 0.25]
+
+
+def test_the_learning_rate_comes_down_at_the_end_of_the_budget(tmp_path):
+    found, stop = rates(tmp_path, 13)
+    assert found == [1.0] * 9 + DOWN
+    assert stop.history == []  # at step 10 the rate was coming down
+
+
+def test_the_learning_rate_comes_down_where_the_loss_has_levelled_off_and_then_the_training_ends(tmp_path):
+    found, stop = rates(tmp_path, 200, when="converged", min_steps=20)
+    levelled = stop.history[-1][0]
+    assert 20 <= levelled < 150
+    assert found == [1.0] * levelled + DOWN
+    assert stop.ends == levelled + 4
+
+
+def test_a_training_that_is_resumed_while_its_rate_comes_down_goes_on_from_there(tmp_path):
+    rates(tmp_path, 13)
+    found, _ = rates(tmp_path, 13, resume="step-11.ckpt")
+    assert found == DOWN[2:]
+
+
+def test_a_training_that_goes_on_after_its_end_has_the_full_rate_again(tmp_path):
+    rates(tmp_path, 12)
+    found, _ = rates(tmp_path, 20, resume="last.ckpt")
+    assert found == [1.0] * 4 + DOWN
+    _, stop = rates(tmp_path, 200, resume="last.ckpt", when="converged", min_steps=20)
+    found, _ = rates(tmp_path, 400, resume="last.ckpt", when="converged", min_steps=stop.ends + 20)
+    assert found[:20] == [1.0] * 20
+
+
+def test_a_rate_that_decays_by_itself_cannot_come_down_once_more():
+    with pytest.raises(UserError, match=r"stop.decay is 4 and model.lr_schedule is cosine, expected constant"):
+        Convergence(decay=4).on_train_start(SimpleNamespace(), Level("cosine"))
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"), [("decay", -1), ("min_steps", -1), ("tolerance", 0.0), ("tolerance", 1.0)]
+)
 def test_settings_that_cannot_work_are_named(setting, value):
     with pytest.raises(UserError, match=f"stop.{setting} is {value}"):
         Convergence(**{setting: value})

@@ -50,7 +50,7 @@ def test_scale_divides_every_budget(tmp_path):
         {node.kind: node.settings for node in nodes(study(tmp_path, scale)).values()} for scale in (1.0, 0.01)
     )
     assert (full["data"]["steps"], small["data"]["steps"]) == (200_000, 2_000)
-    assert (full["skill"]["trainer.max_steps"], small["skill"]["trainer.max_steps"]) == (1500, 15)
+    assert (full["skill"]["trainer.max_steps"], small["skill"]["trainer.max_steps"]) == (1000, 10)
     assert (full["policy"]["trainer.max_steps"], small["policy"]["trainer.max_steps"]) == (8_000, 80)
     assert (full["evaluate"]["episodes"], small["evaluate"]["episodes"]) == (100, 2)
     runner = study(tmp_path, 0.01, tasks=["hopper-medium-expert"])
