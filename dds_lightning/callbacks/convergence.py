@@ -26,8 +26,8 @@ class Convergence(Callback):
         monitor: The metric, logged at validations.
         min_steps: Steps before which a training never stops.
         tolerance: Relative fall of the loss for a quarter more steps that is still worth them.
-        decay: Steps at the end over which the learning rate falls to zero, in a straight line; 0 for none. A training
-            that is continued later goes on at the full rate.
+        decay: Steps at the end over which a constant learning rate falls to zero, in a straight line, though at most a
+            fifth of all; 0 for none. A training that is continued later goes on at the full rate.
 
     Attributes:
         history: (step, loss) of every validation at the full learning rate.
@@ -61,21 +61,13 @@ class Convergence(Callback):
         self.history: list[tuple[int, float]] = []
         self.ends: int | None = None
         self._budget = -1  # steps at which the training ends in any case, -1 for no end
+        self._constant = True
         self._rates: list[float] | None = None  # full learning rates, while they are lowered
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Look when the training ends, and go on where a former one had ended.
-
-        Raises:
-            UserError: The learning rate has a schedule of its own.
-        """
-        schedule = pl_module.hparams.get("lr_schedule", "constant")
-        if self.decay and schedule != "constant":
-            raise UserError(
-                f"stop.decay is {self.decay} and model.lr_schedule is {schedule}, expected constant: a rate can be "
-                "lowered at the end in one way only; set --stop.decay=0 or --model.lr_schedule=constant"
-            )
+        """Look when the training ends and whether its rate is constant, and go on where a former one had ended."""
         self._budget = planned_steps(trainer)
+        self._constant = pl_module.hparams.get("lr_schedule", "constant") == "constant"
         if self.ends is not None and trainer.global_step >= self.ends:
             self.ends = None
 
@@ -95,7 +87,8 @@ class Convergence(Callback):
     def _share(self, step: int) -> float:
         """Share of the full learning rate at a step."""
         end = self._budget if self.ends is None else self.ends
-        return 1.0 if end < 0 or not self.decay else min(1.0, max(0.0, (end - step) / self.decay))
+        down = min(self.decay, end // 5) if self._constant else 0
+        return min(1.0, max(0.0, (end - step) / down)) if down > 0 else 1.0
 
     def on_train_batch_end(self, trainer: pl.Trainer, *_: Any) -> None:
         """Stop when the learning rate has come down."""
@@ -116,7 +109,7 @@ class Convergence(Callback):
             return
         self.history.append((step, float(trainer.callback_metrics[self.monitor])))
         if self.when == "converged" and self.converged:
-            self.ends = step + self.decay if self._budget < 0 else min(step + self.decay, self._budget)
+            self.ends = step + min(self.decay, step // 4) if self._constant else step
             trainer.should_stop = self.ends <= step
 
     @property

@@ -100,7 +100,7 @@ def test_a_metric_that_nobody_logs_is_named_beside_those_that_are():
 class Level(pl.LightningModule):
     """One weight whose held-out loss is always 1; it notes the learning rate of every step."""
 
-    def __init__(self, lr_schedule="constant"):
+    def __init__(self, lr_schedule):
         super().__init__()
         self.save_hyperparameters()
         self.weight, self.rates = torch.nn.Parameter(torch.zeros(1)), []
@@ -122,19 +122,19 @@ class Level(pl.LightningModule):
 
 
 class Keep(pl.Callback):
-    """A checkpoint of step 11."""
+    """A checkpoint of step 21."""
 
     def __init__(self, folder):
         self.folder = folder
 
     def on_train_batch_end(self, trainer, *_):
-        if trainer.global_step == 11:
-            trainer.save_checkpoint(self.folder / "step-11.ckpt")
+        if trainer.global_step == 21:
+            trainer.save_checkpoint(self.folder / "step-21.ckpt")
 
 
-def rates(folder, steps, resume=None, **settings):
+def rates(folder, steps, resume=None, lr_schedule="constant", **settings):
     """The learning rates of a training that validates every 10 steps, and its callback."""
-    module, stop = Level(), Convergence(decay=4, **settings)
+    module, stop = Level(lr_schedule), Convergence(decay=4, **settings)
     base = {"max_steps": steps, "max_epochs": -1, "accelerator": "cpu", "logger": False, "limit_val_batches": 1}
     base |= {"enable_progress_bar": False, "enable_model_summary": False, "num_sanity_val_steps": 0}
     base |= {"val_check_interval": 10, "check_val_every_n_epoch": None}
@@ -147,9 +147,14 @@ DOWN = [1.0, 0.75, 0.5, 0.25]
 
 
 def test_the_learning_rate_comes_down_at_the_end_of_the_budget(tmp_path):
-    found, stop = rates(tmp_path, 13)
-    assert found == [1.0] * 9 + DOWN
-    assert stop.history == []  # at step 10 the rate was coming down
+    found, stop = rates(tmp_path, 23)
+    assert found == [1.0] * 19 + DOWN
+    assert stop.history == [(10, 1.0)]  # at step 20 the rate was coming down
+
+
+def test_it_comes_down_in_a_fifth_of_a_short_training_and_never_where_it_has_a_schedule_of_its_own(tmp_path):
+    assert rates(tmp_path / "short", 10)[0] == [1.0] * 9 + [0.5]
+    assert rates(tmp_path / "cosine", 23, lr_schedule="cosine")[0] == [1.0] * 23
 
 
 def test_the_learning_rate_comes_down_where_the_loss_has_levelled_off_and_then_the_training_ends(tmp_path):
@@ -161,23 +166,18 @@ def test_the_learning_rate_comes_down_where_the_loss_has_levelled_off_and_then_t
 
 
 def test_a_training_that_is_resumed_while_its_rate_comes_down_goes_on_from_there(tmp_path):
-    rates(tmp_path, 13)
-    found, _ = rates(tmp_path, 13, resume="step-11.ckpt")
+    rates(tmp_path, 23)
+    found, _ = rates(tmp_path, 23, resume="step-21.ckpt")
     assert found == DOWN[2:]
 
 
 def test_a_training_that_goes_on_after_its_end_has_the_full_rate_again(tmp_path):
-    rates(tmp_path, 12)
-    found, _ = rates(tmp_path, 20, resume="last.ckpt")
+    rates(tmp_path, 22)
+    found, _ = rates(tmp_path, 30, resume="last.ckpt")
     assert found == [1.0] * 4 + DOWN
     _, stop = rates(tmp_path, 200, resume="last.ckpt", when="converged", min_steps=20)
     found, _ = rates(tmp_path, 400, resume="last.ckpt", when="converged", min_steps=stop.ends + 20)
     assert found[:20] == [1.0] * 20
-
-
-def test_a_rate_that_decays_by_itself_cannot_come_down_once_more():
-    with pytest.raises(UserError, match=r"stop.decay is 4 and model.lr_schedule is cosine, expected constant"):
-        Convergence(decay=4).on_train_start(SimpleNamespace(), Level("cosine"))
 
 
 @pytest.mark.parametrize(
