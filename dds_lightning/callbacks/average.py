@@ -1,4 +1,4 @@
-"""Averaged weights: what a decaying learning rate gives at the end of a training, at every moment of it."""
+"""Averaged weights: much of what a decaying learning rate gives at the end of a training, at every moment of it."""
 
 from typing import Any
 
@@ -13,8 +13,8 @@ from dds_lightning.errors import UserError
 class AverageWeights(WeightAveraging):
     """Validate, save and act with an exponential moving average of the weights, while training goes on with its own.
 
-    With a constant learning rate the average is as good as the end of a decay, so a training need not know
-    beforehand when it ends. A checkpoint's `state_dict` is the average; what a resumed training needs lies beside it.
+    With a constant learning rate the average gives much of what the end of a decay gives, so a training need not know
+    beforehand when it ends (`Convergence` lowers the rate then). A checkpoint's `state_dict` is the average; what a resumed training needs lies beside it.
     Buffers (statistics, usage of codes) are not averaged, nor are parts of the module that have stopped learning: an
     average of codebook and encoder would lag behind both.
 
