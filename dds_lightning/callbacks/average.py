@@ -14,7 +14,8 @@ class AverageWeights(WeightAveraging):
     """Validate, save and act with an exponential moving average of the weights, while training goes on with its own.
 
     With a constant learning rate the average gives much of what the end of a decay gives, so a training need not know
-    beforehand when it ends (`Convergence` lowers the rate then). A checkpoint's `state_dict` is the average; what a resumed training needs lies beside it.
+    beforehand when it ends (`Convergence` lowers the rate then). A checkpoint's `state_dict` is the average; what a
+    resumed training needs lies beside it.
     Buffers (statistics, usage of codes) are not averaged, nor are parts of the module that have stopped learning: an
     average of codebook and encoder would lag behind both.
 
