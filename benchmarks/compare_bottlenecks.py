@@ -46,7 +46,7 @@ MEASURES = (
 """Columns of `compare_recovery`, their names in the table, and a factor."""
 
 
-def data_of(stages: RunDirectory, task: Task, data: str | None) -> tuple[str, list[Done]]:
+def data_of(run: RunDirectory, task: Task, data: str | None) -> tuple[str, list[Done]]:
     """The given data, or newly collected data, as SOURCE:NAME."""
     if data is not None:
         return data, []
@@ -56,11 +56,13 @@ def data_of(stages: RunDirectory, task: Task, data: str | None) -> tuple[str, li
 
         return {"data": collect(task, 200_000, 0, folder, dataset_id=task.name, overwrite=True)}
 
-    done = stages.do("data", f"data: 200,000 steps of {task.name}", {"task": task.name}, [], work)
+    done = run.do("data", f"data: 200,000 steps of {task.name}", {"task": task.name}, [], work)
     return f"local:{done.outputs['data']}", [done]
 
 
-def train(stages: RunDirectory, name: str, task: Task, spec: str, reads: list[Done], settings: list[str], steps: int) -> Path:
+def train(
+    run: RunDirectory, name: str, task: Task, spec: str, reads: list[Done], settings: list[str], steps: int
+) -> Path:
     """Train one model, unless that is already done; return its checkpoint."""
     from dds_lightning.training.stage_cli import StageCLI, quieten
 
@@ -75,7 +77,7 @@ def train(stages: RunDirectory, name: str, task: Task, spec: str, reads: list[Do
         fit = ["fit", "--config", f"{task.family}/skill.yaml", *args, *folders, "--trainer.enable_model_summary=false"]
         return {"checkpoint": Path(StageCLI("skill", [*fit, *resume]).execute().data["checkpoint"])}
 
-    done = stages.do(name, f"{name}: {steps:,} steps", {"words": sorted(args)}, reads, work)
+    done = run.do(name, f"{name}: {steps:,} steps", {"words": sorted(args)}, reads, work)
     return done.outputs["checkpoint"]
 
 
@@ -119,8 +121,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/bottlenecks"))
     arguments = parser.parse_args()
     task, console = get_task(arguments.task), Console(stderr=True)
-    stages = RunDirectory(arguments.out, console)
-    spec, reads = data_of(stages, task, arguments.data)
+    run = RunDirectory(arguments.out, console)
+    spec, reads = data_of(run, task, arguments.data)
     parts = []
     for seed in range(arguments.seeds):
         seeds = [f"--seed_everything={seed}", f"--data.seed={seed}"]
@@ -129,7 +131,7 @@ def main() -> None:
             CONTINUOUS: ("gaussian", ["--model.bottleneck=gaussian"]),
         }
         checkpoints = {
-            kind: train(stages, f"{name}-seed{seed}", task, spec, reads, [*seeds, *settings], arguments.steps)
+            kind: train(run, f"{name}-seed{seed}", task, spec, reads, [*seeds, *settings], arguments.steps)
             for kind, (name, settings) in kinds.items()
         }
         parts.append(measure(task, spec, seed, arguments.skills, checkpoints, console))

@@ -148,8 +148,8 @@ plot_strobes(task, frames, every=13, title="one second of a medium episode (0) a
 # **Third difference: the amount of training.** The paper's exact settings are shipped (`--preset paper`); according to
 # the paper the skills alone took two and a half hours on an RTX 4090. The preset for this body is designed for two CPU
 # cores (`--preset locomotion`): a budget of 28,000 steps for the skills, which ends earlier where their held-out loss
-# levels off. This notebook uses a fraction of it, and narrower networks at a higher learning rate in the policy. (Below,
-# a dash stands for the default of the module: two hidden layers of 256.)
+# levels off. This notebook uses a fraction of it, and in the policy narrower networks at a higher learning rate. Below,
+# a dash stands for the default of the module: two hidden layers of 256.
 #
 # **When is it done?** After `freeze_codes_after` steps encoder and codebook stand still and the decoder learns on
 # alone, at less than half the cost of a step. From `stop.min_steps` on, a line through the later half of the held-out
