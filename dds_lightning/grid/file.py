@@ -62,6 +62,7 @@ BUDGETS = (
     "model.freeze_codes_after",
     "model.warmup_steps",
     "stop.min_steps",
+    "stop.decay",
 )
 """Settings of a stage that `--scale` multiplies."""
 _KEYS: dict[str, tuple[type, ...]] = {

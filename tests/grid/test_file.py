@@ -55,7 +55,8 @@ def test_scale_divides_every_budget(tmp_path):
     assert (full["evaluate"]["episodes"], small["evaluate"]["episodes"]) == (100, 2)
     runner = study(tmp_path, 0.01, tasks=["hopper-medium-expert"])
     (skill,) = (node.settings for node in nodes(runner).values() if node.kind == "skill")
-    assert (skill["model.freeze_codes_after"], skill["trainer.max_steps"]) == (40, 280)
+    named = ("model.freeze_codes_after", "trainer.max_steps", "stop.decay")
+    assert tuple(skill[name] for name in named) == (40, 280, 20)
 
 
 @pytest.mark.parametrize("name", packaged_studies())
