@@ -15,9 +15,8 @@ class AverageWeights(WeightAveraging):
 
     With a constant learning rate the average gives much of what the end of a decay gives, so a training need not know
     beforehand when it ends (`Convergence` lowers the rate then). A checkpoint's `state_dict` is the average; what a
-    resumed training needs lies beside it.
-    Buffers (statistics, usage of codes) are not averaged, nor are parts of the module that have stopped learning: an
-    average of codebook and encoder would lag behind both.
+    resumed training needs lies beside it. Buffers (statistics, usage of codes) are not averaged, nor are parts of the
+    module that have stopped learning: an average of codebook and encoder would lag behind both.
 
     Args:
         decay: Share of the average that a step keeps; the first steps keep less, (1 + n) / (10 + n) after n. Null

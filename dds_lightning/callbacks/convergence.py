@@ -61,13 +61,13 @@ class Convergence(Callback):
         self.history: list[tuple[int, float]] = []
         self.ends: int | None = None
         self._budget = -1  # steps at which the training ends in any case, -1 for no end
-        self._constant = True
+        self._decay = decay  # 0 where the learning rate has a schedule of its own
         self._rates: list[float] | None = None  # full learning rates, while they are lowered
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Look when the training ends and whether its rate is constant, and go on where a former one had ended."""
         self._budget = planned_steps(trainer)
-        self._constant = pl_module.hparams.get("lr_schedule", "constant") == "constant"
+        self._decay = self.decay if pl_module.hparams.get("lr_schedule", "constant") == "constant" else 0
         if self.ends is not None and trainer.global_step >= self.ends:
             self.ends = None
 
@@ -87,7 +87,7 @@ class Convergence(Callback):
     def _share(self, step: int) -> float:
         """Share of the full learning rate at a step."""
         end = self._budget if self.ends is None else self.ends
-        down = min(self.decay, end // 5) if self._constant else 0
+        down = min(self._decay, end // 5)
         return min(1.0, max(0.0, (end - step) / down)) if down > 0 else 1.0
 
     def on_train_batch_end(self, trainer: pl.Trainer, *_: Any) -> None:
@@ -109,7 +109,7 @@ class Convergence(Callback):
             return
         self.history.append((step, float(trainer.callback_metrics[self.monitor])))
         if self.when == "converged" and self.converged:
-            self.ends = step + min(self.decay, step // 4) if self._constant else step
+            self.ends = step + min(self._decay, step // 4)
             trainer.should_stop = self.ends <= step
 
     @property
