@@ -16,6 +16,7 @@ def run(
     gpus: float = 0,
     minutes: int = 240,
     plan: bool = False,
+    known: list[str] | None = None,
 ) -> Report:
     """Run a study: every cell of a grid over tasks, methods, settings and seeds, then its report.
 
@@ -36,10 +37,12 @@ def run(
         gpus: GPUs of each job on Ray or Slurm.
         minutes: Time limit of a job on Slurm, after which it is queued again and goes on.
         plan: Only say how much there is to do.
+        known: `results.json` of reports, or their folders: what they hold, from another machine say, is not done again.
     """
     from dds_lightning.grid.run import Asked, run_study
 
-    return run_study(Asked(file, Path(out), engine, workers, scale, cpus, gpus, minutes, plan))
+    places = [Path(one) for one in known or []]
+    return run_study(Asked(file, Path(out), engine, workers, scale, cpus, gpus, minutes, plan, places))
 
 
 def report(directory: str) -> Report:

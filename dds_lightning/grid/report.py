@@ -12,6 +12,7 @@ import pandas as pd
 
 from dds_lightning.console.reports import Report, table
 from dds_lightning.grid import figures
+from dds_lightning.grid.found import FILE as FOUND
 from dds_lightning.grid.results import PULLS, Results
 from dds_lightning.saving.files import written_whole
 from dds_lightning.saving.run_directory import duration
@@ -61,6 +62,7 @@ def report_study(place: Path) -> Report:
     }.items():
         with written_whole(folder / file) as part:
             part.write_text(text, encoding="utf-8")
+    results.found.save(folder / FOUND)
     comparison = results.comparison()
     told: list[Any] = [table(results.table(), str(results.study["title"]))]
     told += [table(comparison)] if len(comparison) > 1 else []
@@ -99,13 +101,11 @@ def _sections(results: Results) -> list[Section]:
         sections.append(Section("The best checkpoint, apart", [told], results.table("best")))
     if study["paper"] == "figure6" and cells["horizon"].notna().any():
         sections.append(Section("Score over the horizon", [], None, figures.plot_horizon(cells), "horizon"))
-    if results.curves:
+    if curves := results.found.curves:
         online: dict[str, list[pd.DataFrame]] = {}
         for row in results.cells.to_dict("records"):
-            if row["key"] in results.curves:
-                online.setdefault(results.label(row.get("variant", row["method"])), []).append(
-                    results.curves[row["key"]]
-                )
+            if row["key"] in curves:
+                online.setdefault(results.label(row.get("variant", row["method"])), []).append(curves[row["key"]])
         sections.append(Section("While learning online", [], None, figures.plot_online(online), "online"))
     return [*sections, *_statistics(results), *_making(results)]
 
@@ -140,7 +140,7 @@ def _making(results: Results) -> list[Section]:
         ", ".join(f"{name} {version}" for name, version in one["versions"].items())
         + (f"; commit {one['commit']}" if one.get("commit") else "")
         + f"; {one['machine']}"
-        for one in results.made
+        for one in results.found.made()
     ]
     shown = results.cells[["title", "state", "score", "best", "chosen", "seconds"]].copy()
     shown = shown if shown["chosen"].any() else shown.drop(columns="chosen")

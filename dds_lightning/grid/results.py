@@ -1,9 +1,7 @@
-"""The results of a study as tables, read from the nodes that its cells are."""
+"""The results of a study as tables, from what its cells have found."""
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,14 +13,15 @@ from numpy.typing import NDArray
 
 from dds_lightning.errors import UserError
 from dds_lightning.grid.file import BASE, PLAYERS
-from dds_lightning.grid.job import MADE, NODES
-from dds_lightning.saving.arrays import read_parquet
-from dds_lightning.saving.run_directory import Done, finished, read_marker
-from dds_lightning.saving.untrusted import TEXT, conform, mapping, parsing, read_csv, read_json
+from dds_lightning.grid.found import Found, check_key
+from dds_lightning.grid.job import NODES
+from dds_lightning.saving.untrusted import TEXT, conform, mapping, parsing, read_json
 from dds_lightning.study.paper import number_of
 from dds_lightning.study.protocol import BEST, LAST
 from dds_lightning.study.statistics import evaluation_curve, interval, mean_std, probability_of_improvement
 
+KNOWN = "known.json"
+"""What was found elsewhere, in a study's folder."""
 PULLS = 100
 """Evaluation episodes that the curve of `evaluation_curve` goes up to."""
 
@@ -38,20 +37,14 @@ class Results:
         cells: A row for each cell: coordinates, `seed`, `state`, `score` (of the last checkpoint), `best` (of the best
             checkpoint; NaN without one), `chosen` (how), `horizon`, `hold`, `seconds` (of the evaluation and all that
             it reads), `key`, `commands`.
-        episodes: Key -> scores of the last checkpoint's episodes.
-        curves: Key -> what was reached while learning online: `env_steps` and `value`.
-        made: Distinct versions, commits and machines.
-        seconds: Of all nodes of the study, each counted once.
+        found: What the cells are made of.
     """
 
     place: Path
     study: Mapping[str, Any]
     command: str
     cells: pd.DataFrame
-    episodes: Mapping[str, NDArray[np.float64]]
-    curves: Mapping[str, pd.DataFrame]
-    made: list[dict[str, Any]]
-    seconds: float
+    found: Found
 
     @classmethod
     def read(cls, place: Path) -> Results:
@@ -68,28 +61,18 @@ class Results:
 
     @classmethod
     def _read(cls, place: Path, file: Path) -> Results:
-        found = mapping(read_json(file, 64 * TEXT, root=place), file)
-        conform(found, {"study": (dict,), "cells": (list,), "command": (str,)}, str(file))
-        nodes, seen = place.parent / NODES, dict[str, Done | None]()
-        rows, episodes, curves, made = [], {}, {}, dict[str, dict[str, Any]]()
-        for cell in found["cells"]:
-            for key in cell["nodes"]:
-                if not re.fullmatch(r"[a-z0-9_]+-[0-9a-f]{16}", str(key)):
-                    raise UserError(f"{file}: {key!r} is no name of a job: run the study again")
-                if key not in seen:
-                    seen[key] = finished(nodes / key)
-                    if (nodes / key / MADE).is_file():
-                        one = mapping(read_json(nodes / key / MADE, root=nodes / key), key)
-                        made[json.dumps(one, sort_keys=True)] = one
-            rows.append(_row(cell, seen))
-            if (done := seen[cell["key"]]) is not None:
-                table = read_parquet(done.outputs["episodes"], {"actor": "O", "score": "f"}, "run the study again")
-                episodes[cell["key"]] = table.loc[table["actor"] == LAST, "score"].to_numpy(np.float64)
-            if (curve := _curve(cell, nodes)) is not None:
-                curves[cell["key"]] = curve
-        seconds = sum(done.seconds for done in seen.values() if done is not None)
-        study = dict(found["study"])
-        return cls(place, study, found["command"], pd.DataFrame(rows), episodes, curves, list(made.values()), seconds)
+        read = mapping(read_json(file, 64 * TEXT, root=place), file)
+        conform(read, {"study": (dict,), "cells": (list,), "command": (str,)}, str(file))
+        cells = {cell["key"]: [check_key(key, file) for key in cell["nodes"]] for cell in read["cells"]}
+        found = Found.load(place / KNOWN) if (place / KNOWN).is_file() else Found()
+        found |= Found.of_nodes(place.parent / NODES, cells)
+        table = pd.DataFrame([_row(cell, found) for cell in read["cells"]])
+        return cls(place, dict(read["study"]), read["command"], table, found)
+
+    @property
+    def seconds(self) -> float:
+        """Of all jobs of the study, each counted once."""
+        return sum(work.seconds for work in self.found.works.values())
 
     def label(self, name: Any) -> str:
         """What the report calls an axis or a value."""
@@ -160,45 +143,28 @@ class Results:
 
     def budgets(self) -> dict[str, NDArray[np.float64]]:
         """Task and method -> score of the setting that so many evaluation episodes find, see `evaluation_curve`."""
-        found = {}
+        found, outcomes = {}, self.found.outcomes
         for (task, method), part in self.cells.groupby(["task", "method"], sort=False):
-            runs = [self.episodes[key] for key in part["key"] if key in self.episodes]
+            runs = [outcomes[key].episodes for key in part["key"] if key in outcomes]
             if len(runs) > 1:
                 count = min(map(len, runs))
                 found[f"{PLAYERS[method].title} on {task}"] = evaluation_curve([run[:count] for run in runs], PULLS)
         return found
 
 
-def _row(cell: Mapping[str, Any], nodes: Mapping[str, Done | None]) -> dict[str, Any]:
+def _row(cell: Mapping[str, Any], found: Found) -> dict[str, Any]:
     """One row of `Results.cells`."""
     row = {"task": cell["task"], "method": cell["method"], **cell["place"], "seed": cell["seed"], "key": cell["key"]}
     row |= {"title": cell["title"], "state": "open", "score": np.nan, "best": np.nan, "chosen": ""}
     row |= {"horizon": np.nan, "hold": np.nan}
-    done = nodes[cell["key"]]
-    if done is not None:
-        scores = {one["actor"]: one["score"] for one in done.facts["results"]}
-        row |= {"state": "done", "score": scores[LAST], "best": scores.get(BEST, np.nan)}
-    read = [one for key in cell["nodes"] if (one := nodes[key]) is not None]
-    row["seconds"] = sum(one.seconds for one in read)
-    row["commands"] = [str(one.facts["command"]) for one in read if "command" in one.facts]
-    for one in read:
-        if chosen := one.facts.get("chosen"):
-            row["chosen"] = f"{chosen['monitor']} at step {chosen['step']:,}"
-        if one.name.startswith("skill-"):
-            row["horizon"] = row["hold"] = read_marker(one.folder)["settings"]["data.horizon"]
+    if (outcome := found.outcomes.get(cell["key"])) is not None:
+        row |= {"state": "done", "score": outcome.scores[LAST], "best": outcome.scores.get(BEST, np.nan)}
+    works = [found.works[key] for key in cell["nodes"] if key in found.works]
+    row["seconds"] = sum(work.seconds for work in works)
+    row["commands"] = [work.command for work in works if work.command is not None]
+    for work in works:
+        row["chosen"] = work.chosen or row["chosen"]
+        if work.horizon is not None:
+            row["horizon"] = row["hold"] = work.horizon
     row["hold"] = cell["settings"].get("evaluate.hold", row["hold"])
     return row
-
-
-def _curve(cell: Mapping[str, Any], root: Path) -> pd.DataFrame | None:
-    """What an online training reached over environment steps; None for a cell without one."""
-    online = next((key for key in cell["nodes"] if key.startswith("online-")), None)
-    files = sorted((root / online).glob("logs/version_*/metrics.csv")) if online else []
-    if not files:
-        return None
-    table = pd.concat([read_csv(path, {"step": "iuf"}) for path in files])
-    value = next((name for name in ("online/success", "online/return") if name in table), None)
-    if value is None or "online/env_steps" not in table:
-        return None
-    table = table.drop_duplicates("step", keep="last").rename(columns={"online/env_steps": "env_steps", value: "value"})
-    return table[["env_steps", "value"]].dropna().sort_values("env_steps")

@@ -4,13 +4,14 @@
  OUT/nodes/KIND-HASH/    one piece of work each, shared by all studies in OUT
  OUT/logs/KIND-HASH.txt  what it printed
  OUT/NAME/cells.json     the cells of the study NAME, and the evaluation that each is
- OUT/NAME/report/        tables, figures and one page
+ OUT/NAME/known.json     what cells have found elsewhere (--known)
+ OUT/NAME/report/        tables, figures, one page, and results.json, from which another folder can go on
 ```
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -22,10 +23,13 @@ from dds_lightning.envs.pool import available_cores
 from dds_lightning.errors import UserError
 from dds_lightning.grid.engines import ENGINES, Engine, Local, RayTasks, Slurm
 from dds_lightning.grid.file import Cell, Study, find_study, read_study
+from dds_lightning.grid.found import FILE as FOUND
+from dds_lightning.grid.found import Found
 from dds_lightning.grid.job import NODES
 from dds_lightning.grid.loop import Progress, run_nodes
 from dds_lightning.grid.nodes import Node, in_order, needed, plan
-from dds_lightning.saving.run_directory import duration, finished, locked, write_json
+from dds_lightning.grid.results import KNOWN
+from dds_lightning.saving.run_directory import Done, duration, finished, locked, write_json
 
 CELLS = "cells.json"
 
@@ -43,6 +47,7 @@ class Asked:
     gpus: float = 0
     minutes: int = 240
     plan_only: bool = False
+    known: Sequence[Path] = ()
 
 
 def run_study(asked: Asked) -> Report:
@@ -63,11 +68,14 @@ def run_study(asked: Asked) -> Report:
     cells = plan(study)
     nodes = in_order(node for _, node in cells.values())
     place = asked.out / (path.stem if study.scale == 1 else f"{path.stem}@{study.scale:g}")
+    known = _known(asked, place, nodes)
     if asked.plan_only:
-        return _planned(asked, study, cells, nodes)
+        return _planned(asked, study, cells, nodes, known)
     with locked(asked.out):
         write_json(place / CELLS, _table(study, cells, asked))
-        failed = do_nodes(asked, nodes)
+        if known.outcomes:
+            known.save(place / KNOWN)
+        failed = do_nodes(asked, nodes, known)
     from dds_lightning.grid.report import report_study
 
     report = report_study(place)
@@ -81,19 +89,25 @@ def run_study(asked: Asked) -> Report:
     return report
 
 
-def do_nodes(asked: Asked, nodes: Mapping[str, Node]) -> dict[str, str]:
+def do_nodes(asked: Asked, nodes: Mapping[str, Node], known: Found) -> dict[str, str]:
     """Do those nodes that are not done and are needed.
+
+    Args:
+        asked: Says where and how.
+        nodes: Of all cells, each after what it reads.
+        known: What was found elsewhere.
 
     Returns:
         Key -> why it failed.
     """
     console = Terminal(stderr=True)
     progress = Progress(0, 1)
-    done = set()
+    done = set(known.outcomes)
     for key, node in nodes.items():
-        if (found := finished(asked.out / NODES / key)) is not None:
-            done.add(key)
+        if (found := finished(asked.out / NODES / key) or known.works.get(key)) is not None:
             progress.past[node.kind].append(found.seconds)
+        if isinstance(found, Done):
+            done.add(key)
     todo = needed(nodes, done)
     progress.total = len(todo)
     console.print(f"{len(nodes)} jobs, {len(done)} of them done before, {len(todo)} to do")
@@ -135,9 +149,25 @@ def _table(study: Study, cells: Mapping[str, tuple[Cell, Node]], asked: Asked) -
     return {"format": 1, "study": asdict(study), "cells": rows, "command": command}
 
 
-def _planned(asked: Asked, study: Study, cells: Mapping[str, tuple[Cell, Node]], nodes: Mapping[str, Node]) -> Report:
+def _known(asked: Asked, place: Path, nodes: Mapping[str, Node]) -> Found:
+    """What this study's cells have found elsewhere: in the files that were given now, and when it was run before."""
+    found = Found.load(place / KNOWN).only(nodes) if (place / KNOWN).is_file() else Found()
+    for file in asked.known:
+        given = Found.load(file / FOUND if file.is_dir() else file).only(nodes)
+        if not given.outcomes:
+            raise UserError(
+                f"--known: {file} has no cell of this study: its task, settings, seeds or preset are other ones; leave "
+                "it out"
+            )
+        found |= given
+    return found
+
+
+def _planned(
+    asked: Asked, study: Study, cells: Mapping[str, tuple[Cell, Node]], nodes: Mapping[str, Node], known: Found
+) -> Report:
     """What would be done."""
-    done = {key for key in nodes if finished(asked.out / NODES / key) is not None}
+    done = set(known.outcomes) | {key for key in nodes if finished(asked.out / NODES / key) is not None}
     kinds: dict[str, int] = {}
     for node in needed(nodes, done).values():
         kinds[node.kind] = kinds.get(node.kind, 0) + 1
