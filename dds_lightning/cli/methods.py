@@ -6,14 +6,15 @@ from pathlib import Path
 from typing import Any
 
 from dds_lightning.baselines.methods import METHODS, Method, method_of
-from dds_lightning.console.reports import Report, table
+from dds_lightning.console.reports import Report
 from dds_lightning.errors import UserError
 from dds_lightning.rollout.actors import Contestant
 from dds_lightning.rollout.play import rollout
 from dds_lightning.saving.checkpoint import load_ckpt, stage_of
 from dds_lightning.saving.published import load_published
+from dds_lightning.study.evaluate import episodes_to_play, report_episodes
 from dds_lightning.study.loose import loose_task
-from dds_lightning.study.protocol import LAST, full_name, paper_line
+from dds_lightning.study.protocol import LAST, full_name
 from dds_lightning.tasks import Task
 
 
@@ -65,9 +66,7 @@ def evaluate_baseline(
     wanted = loose_task(task, policy, skill)
     if wanted is None:
         raise UserError(f"{policy} does not say which task it is for: give --task; `dds tasks` lists them")
-    count = wanted.evaluation_episodes if episodes is None else episodes
-    if count < 1:
-        raise UserError(f"--episodes is {count}, expected at least 1")
+    count = episodes_to_play(wanted, episodes)
     actor = method.play({name: path for name, path in given.items() if path is not None})
     _refuse_other_task(actor, policy, wanted)
     result = rollout(wanted, [Contestant(method.title, actor, count)], seed=seed, workers=workers)
@@ -77,18 +76,9 @@ def evaluate_baseline(
     facts |= {"episodes": count, "seed": seed, "checkpoint": LAST, "horizon": getattr(actor, "horizon", None)}
     facts |= dict.fromkeys(("noise_scale", "sampler", "temperature", "best"))
     facts |= {name: getattr(wanted, name) for name in ("max_episode_steps", "score_min", "score_max", "paper_score")}
-    hidden = ["checkpoint", *([] if wanted.measures_success else ["success", "length_success"])]
     how = f"{facts['task']} ({wanted.env_id}): {count} episodes, seed {seed}; {method.title}, {method.source}"
-    lines: list[Any] = [how, table(summary.drop(columns=hidden))]
-    lines += [line] if (line := paper_line(wanted)) else []
-    data = {"agent": policy, "best": None, "task": wanted.name, "seed": seed, "protocol": facts, "results": summary}
-    report = Report(data, lines)
-    if out is not None:
-        Path(out).parent.mkdir(parents=True, exist_ok=True)
-        result.episodes.to_parquet(out, index=False)
-        report.data["episodes"] = out
-        report.text.append(out)
-    return report
+    data = {"agent": policy, "best": None, "task": wanted.name, "seed": seed, "protocol": facts}
+    return report_episodes(result, summary, wanted, [how], data, out)
 
 
 def _refuse_other_task(actor: Any, path: str, task: Task) -> None:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
+
+import pandas as pd
 
 from dds_lightning.agent import DDSAgent
 from dds_lightning.console.reports import Report, table
 from dds_lightning.errors import UserError
 from dds_lightning.rollout.actors import Contestant
 from dds_lightning.rollout.play import rollout
+from dds_lightning.rollout.result import RolloutResult
 from dds_lightning.saving.published import CONFIG, load_published
 from dds_lightning.saving.untrusted import conform
 from dds_lightning.study.contestants import agent_directory, best_directory, way
@@ -54,9 +57,7 @@ def evaluate(
     wanted = loose_task(task, policy, skill) if skill else loose_task(task, str(first))
     if wanted is None:
         raise UserError(f"{first} does not say which task it is for: give --task; `dds tasks` lists them")
-    count = wanted.evaluation_episodes if episodes is None else episodes
-    if count < 1:
-        raise UserError(f"--episodes is {count}, expected at least 1")
+    count = episodes_to_play(wanted, episodes)
     chosen = {"noise_scale": noise_scale, "hold": hold}
     acting: dict[str, Any] = {"seed": seed, **{name: value for name, value in chosen.items() if value is not None}}
     agents = {
@@ -80,11 +81,45 @@ def evaluate(
     summary = result.summary()
     summary.insert(1, "checkpoint", summary["actor"].map(shown))
     data: dict[str, Any] = {"agent": places.get(LAST), "best": places.get(BEST), "task": wanted.name, "seed": seed}
-    hidden = ["checkpoint", *([] if wanted.measures_success else ["success", "length_success"])]
     differing = [f"The best checkpoint's: {heading({**other, 'checkpoint': BEST})}" for other in others if other != how]
-    lines: list[Any] = [heading(how), *differing, table(summary.drop(columns=hidden))]
-    lines += [line] if (line := paper_line(wanted)) else []
-    report = Report({**data, "protocol": how, "results": summary}, lines)
+    told = [heading(how), *differing]
+    return report_episodes(result, summary, wanted, told, {**data, "protocol": how}, out)
+
+
+def episodes_to_play(task: Task, asked: int | None) -> int:
+    """How many episodes an evaluation has: those asked for, else the task's.
+
+    Raises:
+        UserError: None at all.
+    """
+    count = task.evaluation_episodes if asked is None else asked
+    if count < 1:
+        raise UserError(f"--episodes is {count}, expected at least 1")
+    return count
+
+
+def report_episodes(
+    result: RolloutResult,
+    summary: pd.DataFrame,
+    task: Task,
+    told: Sequence[str],
+    data: Mapping[str, Any],
+    out: str | None,
+) -> Report:
+    """The report of an evaluation, and its episodes as a file where one was asked for.
+
+    Args:
+        result: What was played.
+        summary: A row for each player, with its `checkpoint`.
+        task: What was played.
+        told: Sentences before the table.
+        data: What the report holds beside `results`.
+        out: Parquet file for the episodes.
+    """
+    hidden = ["checkpoint", *([] if task.measures_success else ["success", "length_success"])]
+    lines: list[Any] = [*told, table(summary.drop(columns=hidden))]
+    lines += [line] if (line := paper_line(task)) else []
+    report = Report({**data, "results": summary}, lines)
     if out is not None:
         Path(out).parent.mkdir(parents=True, exist_ok=True)
         result.episodes.to_parquet(out, index=False)
