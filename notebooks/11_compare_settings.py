@@ -184,5 +184,5 @@ checks.round(2)
 #
 # ```bash
 # dds study run table2 --plan        # the paper's table 2 on PointMaze-Large: K and D, three seeds
-# dds study run table2 --workers 2   # about four minutes of one core for each of its 48 cells
+# dds study run table2 --workers 2   # about two minutes of one core for each of its 48 cells
 # ```
