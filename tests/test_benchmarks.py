@@ -4,6 +4,7 @@ import runpy
 import sys
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 ROOT = Path(__file__).parents[1]
@@ -14,3 +15,15 @@ def test_every_benchmark_can_be_imported(path, monkeypatch):
     """Its story: a class had a new name, and one of them had not run since."""
     monkeypatch.setattr(sys, "path", [str(path.parent), *sys.path])
     assert runpy.run_path(str(path), run_name="imported")["__doc__"]
+
+
+def test_the_benchmark_for_a_gpu_runs_on_a_processor(monkeypatch, tmp_path, capsys):
+    """It waits for a machine that has one: its code must run until then."""
+    monkeypatch.setattr(sys, "path", [str(ROOT / "benchmarks"), *sys.path])
+    words = ["--device", "cpu", "--steps", "2", "--rows", "600", "--variants", "host", "device", "--stages", "clone"]
+    monkeypatch.setattr(sys, "argv", ["accelerator.py", *words, "--out", str(tmp_path)])
+    runpy.run_path(str(ROOT / "benchmarks" / "accelerator.py"), run_name="__main__")
+    table = pd.read_parquet(tmp_path / "accelerator.parquet")
+    assert len(table) == 3
+    assert (table["steps_per_s"] > 0).all()
+    assert (tmp_path / "accelerator.md").read_text().strip() == capsys.readouterr().out.strip()
