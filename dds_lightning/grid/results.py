@@ -141,6 +141,35 @@ class Results:
         table = pd.DataFrame(rows)
         return table.rename(columns={"P(better)": f"P(better than {first})"}) if first else table
 
+    def effects(self) -> pd.DataFrame:
+        """A row for each value of each axis, over all values of the others; empty where there is one axis.
+
+        Runs are those of all cells with the value, stratified by where they stand on the other axes; a value that lacks
+        cells is left out.
+        """
+        axes = [axis for axis in (*self.study["grid"], "method", "variant") if self._varies(axis)]
+        rows: list[dict[str, Any]] = []
+        for axis in axes if len(axes) > 1 else []:
+            others = ["task", *(other for other in axes if other != axis)]
+            groups = {
+                value: part.pivot_table(index="seed", columns=others, values="score", sort=False)
+                for value, part in self.cells.groupby(axis, sort=False)
+            }
+            whole = {value: part for value, part in groups.items() if part.size and not part.isna().any(axis=None)}
+            size = max((part.size for part in whole.values()), default=0)
+            found = [(value, part, interval(part)) for value, part in whole.items() if part.size == size]
+            for value, part, middle in found:
+                row = {"setting": self.label(axis), "value": self.label(value), "runs": part.size, "IQM": middle.value}
+                row |= {"low": middle.low, "high": middle.high, "P(better than the first)": np.nan}
+                if value != found[0][0]:
+                    row["P(better than the first)"] = probability_of_improvement(part, found[0][1]).value
+                apart = [self.label(other) for other, _, its in found if middle.low > its.high]
+                rows.append(row | {"clearly above": ", ".join(apart)})
+        return pd.DataFrame(rows)
+
+    def _varies(self, axis: str) -> bool:
+        return axis in self.cells and self.cells[axis].nunique(dropna=False) > 1
+
     def budgets(self) -> dict[str, NDArray[np.float64]]:
         """Task and method -> score of the setting that so many evaluation episodes find, see `evaluation_curve`."""
         found, outcomes = {}, self.found.outcomes

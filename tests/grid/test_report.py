@@ -62,7 +62,7 @@ def made(tmp_path, best=False, left_out=(), **keys):
     root = tmp_path / NODES
     directory = RunDirectory(root, Console(quiet=True))
     for index, (cell, node) in enumerate(cells.values()):
-        score = SCORES[tuple(cell.place.values())][cell.seed]
+        score = SCORES.get(tuple(cell.place.values()), (1, 2, 3))[cell.seed]
         work = evaluation({"last": score, **({"best": score + 1} if best else {})})
         for one in in_order([node]).values():
             if one.kind == "evaluate" and index in left_out:
@@ -95,6 +95,22 @@ def test_settings_are_compared_by_intervals_with_the_first(tmp_path):
     better = table["P(better than D 32, K 4)"].tolist()
     assert np.isnan(better[0])
     assert better[1:] == [1, 1, 1]
+
+
+def test_each_setting_is_judged_over_all_values_of_the_others(tmp_path):
+    table = Results.read(made(tmp_path)).effects()
+    assert table["setting"].tolist() == ["D", "D", "K", "K"]
+    assert table["value"].tolist() == ["32", "64", "4", "8"]
+    assert table["runs"].tolist() == [6, 6, 6, 6]
+    # The middle half of 10, 20, 30, 40, 50, 60 and of 50, 50, 50, 90, 95, 100.
+    assert table["IQM"].tolist()[:2] == [35, (50 + 50 + 90 + 95) / 4]
+    better = table["P(better than the first)"]
+    assert better.isna().tolist() == [True, False, True, False]
+    assert better[1] == 1.0, "D 64 beats D 32 with every K"
+    assert better[3] == 1.0
+    assert table["clearly above"].tolist()[0] == ""
+    one_axis = made(tmp_path / "one", grid={"skill.model.num_skills": [4, 8]}, columns=[], rows=[], labels={})
+    assert Results.read(one_axis).effects().empty
 
 
 def test_the_page_says_how_every_number_was_made(tmp_path):
