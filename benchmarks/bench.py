@@ -51,6 +51,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from datamodules.loader import TensorLoader
 from dds_lightning.baselines.behaviour_cloning import BehaviourCloning
 from dds_lightning.callbacks.compiled import CompiledLoss
+from dds_lightning.callbacks.several import SeveralUpdates
 from dds_lightning.module import StageModule
 from dds_lightning.policy import PolicyModule
 from dds_lightning.saving.files import written_whole
@@ -58,6 +59,8 @@ from dds_lightning.study.tables import markdown
 from dds_lightning.training.fit import quieten
 from dds_lightning.training.trainer import trainer_settings
 
+FIRST = 5
+"""Steps before the clock starts, and of a group where several are taken at once."""
 PRECISIONS = {"32-true": torch.float32, "bf16-mixed": torch.bfloat16}
 PEERS = {
     "policy": {
@@ -123,25 +126,26 @@ def trained(
 ) -> Callable[[int], None]:
     """Steps of a module through the Trainer."""
 
-    def work(steps: int) -> float:
-        usual = {"accelerator": "cpu", "precision": precision, "max_steps": steps + 5, "max_epochs": -1}
+    def work(asked: int) -> float:
+        steps = -(-asked // FIRST) * FIRST
+        usual = {"accelerator": "cpu", "precision": precision, "max_steps": steps + FIRST, "max_epochs": -1}
         quiet = dict.fromkeys(("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary"), False)
         clock = _Clock()
         pl.Trainer(**trainer_settings({**usual, **quiet, "callbacks": [clock, *callbacks]}, [])).fit(
-            make(), Ready(batch, steps + 5)
+            make(), Ready(batch, steps + FIRST)
         )
-        return clock.seconds
+        return clock.seconds * asked / steps
 
     return work
 
 
 class _Clock(pl.Callback):
-    """Processor time of all steps but the first five."""
+    """Processor time of all steps but the first."""
 
     seconds = 0.0
 
     def on_train_batch_end(self, trainer: pl.Trainer, *_: Any) -> None:
-        if trainer.global_step == 5:
+        if trainer.global_step == FIRST:
             self.began = time.process_time()
 
     def on_train_end(self, *_: Any) -> None:
@@ -161,6 +165,8 @@ def contenders() -> Iterator[Contender]:
             if stage != "skill":  # whose step hardly consists of anything but products
                 compiled = trained(make, batch, precision, CompiledLoss())
                 yield Contender(stage, "through the Trainer, compiled", precision, compiled, flops, True)
+                both = trained(make, batch, precision, CompiledLoss(), SeveralUpdates(FIRST))
+                yield Contender(stage, "compiled, several updates a round", precision, both, flops, True)
         for name, peer in PEERS.get(stage.partition(",")[0], {}).items():
             try:
                 update = peer(batch, SKILLS)

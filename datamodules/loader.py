@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -52,6 +53,10 @@ class TensorLoader:
     iteration begins at the first item. `state_dict` and `load_state_dict` hold the place in the stream, to
     the batch; Lightning saves and restores them by itself. There are no workers: indexing is cheaper than a
     message.
+
+    Attributes:
+        group: With more than one, an iteration hands out lists of so many batches, as many lists as it would batches:
+            the stream goes on across epochs.
     """
 
     def __init__(
@@ -89,6 +94,7 @@ class TensorLoader:
         self._share = size // world_size
         self.batch_size = min(batch_size, self._share)
         self.drop_last = drop_last
+        self.group = 1
         self._epoch, self._batch, self._resuming = 0, 0, False
 
     def __len__(self) -> int:
@@ -104,16 +110,22 @@ class TensorLoader:
         generator = torch.Generator().manual_seed(int(entropy >> np.uint64(1)))
         return torch.randperm(self.size, generator=generator)
 
-    def __iter__(self) -> Iterator[Batch]:
-        """The next `len(self)` batches of the stream; without shuffling, those of one epoch."""
+    def __iter__(self) -> Iterator[Batch | list[Batch]]:
+        """The next `len(self)` batches, or groups of them, of the stream; without shuffling, those of one epoch."""
         # All of this runs at the first `next`: Lightning makes iterators that it never starts. Nothing after
         # the last `yield` matters: it does not exhaust those that it does start.
         if not self.shuffle and not self._resuming:
             self._epoch, self._batch = 0, 0
         count = len(self) if self.shuffle else len(self) - self._batch
         self._resuming = False
-        order = self._share_of(self._epoch)
+        stream = self._stream()
         for _ in range(count):
+            yield next(stream) if self.group == 1 else list(islice(stream, self.group))
+
+    def _stream(self) -> Iterator[Batch]:
+        """Batches without an end."""
+        order = self._share_of(self._epoch)
+        while True:
             if self._batch >= len(self):
                 self._epoch, self._batch = self._epoch + 1, 0
                 order = self._share_of(self._epoch)

@@ -344,6 +344,6 @@ def adam(
 
 
 def is_log_step(module: pl.LightningModule) -> bool:
-    """Whether this step is logged: `log_dict` at every step of a small network costs as much as the step."""
+    """Whether this step is logged, which costs as much as a small step: the first, and those Lightning writes after."""
     every = getattr(module.trainer, "log_every_n_steps", 50)
-    return every > 0 and module.global_step % every == 0
+    return every > 0 and (module.global_step == 0 or (module.global_step + 1) % every == 0)

@@ -13,6 +13,8 @@ import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback
 
+from dds_lightning.callbacks.several import refuse_other_groups
+
 
 def rng_state() -> dict[str, Any]:
     """State of the global streams of torch, CUDA, NumPy and Python, as tensors and plain values.
@@ -95,7 +97,13 @@ class ExactResume(Callback):
     def on_load_checkpoint(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Keep the streams until training starts: what runs before must not advance them."""
+        """Keep the streams until training starts: what runs before must not advance them.
+
+        Raises:
+            UserError: The checkpoint's counters count something else, see `SeveralUpdates`.
+        """
+        if trainer.state.fn == "fit":
+            refuse_other_groups(trainer, checkpoint)
         self._states = checkpoint.get("rng")
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:

@@ -26,7 +26,7 @@ from torch.nn.functional import one_hot
 
 import dds_lightning.losses as losses
 from dds_lightning.errors import UserError
-from dds_lightning.module import StageModule, adam
+from dds_lightning.module import StageModule, adam, is_log_step
 from dds_lightning.nn.draws import categorical
 from dds_lightning.nn.mlp import MLP, FourierFeatures
 from dds_lightning.nn.normaliser import ActionBox, Normaliser
@@ -336,7 +336,7 @@ class SACModule(StageModule):
         """Log the losses, and how the episodes went that were collected."""
         super().log_training(total, more)
         collected = getattr(getattr(self.trainer, "datamodule", None), "collected", None)
-        if collected is not None and self.global_step % max(getattr(self.trainer, "log_every_n_steps", 50), 1) == 0:
+        if collected is not None and is_log_step(self):
             self.log_dict({f"online/{name}": float(value) for name, value in collected().items()})
 
     @torch.no_grad()
