@@ -9,6 +9,7 @@ from dds_lightning.configs import (
     ROOT,
     RUN_DEFAULTS,
     find,
+    known_as,
     packaged,
     resolve_configs,
     run_defaults,
@@ -154,3 +155,10 @@ def test_a_run_tells_the_command_that_makes_it_again():
     assert asked.command() == (
         "dds run hopper-medium --seed=3 --data_steps=5000 --noise_scale=0.25 --policy.model.alpha=10"
     )
+
+
+def test_a_command_names_a_packaged_configuration_as_people_type_it():
+    assert known_as(str(find("pointmaze/skill.yaml"))) == "pointmaze/skill.yaml"
+    assert [known_as(word) for word in ("--config", "pointmaze/skill.yaml", "/elsewhere/skill.yaml")] == [
+        "--config", "pointmaze/skill.yaml", "/elsewhere/skill.yaml"
+    ]  # fmt: skip

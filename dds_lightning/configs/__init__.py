@@ -42,6 +42,12 @@ def find(name: str) -> Path:
     raise UserError(f"--config: there is no file {name}, and the packaged ones are {', '.join(packaged())}")
 
 
+def known_as(word: str) -> str:
+    """A word of a command line as people type it: the name of a packaged configuration in place of its path."""
+    path = Path(word)
+    return str(path.relative_to(ROOT)) if path.is_absolute() and path.is_relative_to(ROOT) else word
+
+
 def run_defaults(name: str) -> dict[str, Any]:
     """What a preset says about `dds run` apart from its trainings; it need not have a `run.yaml`.
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dds_lightning.agent import DDSAgent
+from dds_lightning.configs import known_as
 from dds_lightning.errors import UserError
 from dds_lightning.grid.file import PLAYERS
 from dds_lightning.grid.nodes import arguments
@@ -67,7 +68,7 @@ def train(settings: Facts, how: Facts, reads: Reads, folder: Path, resuming: boo
     fitted = command(stage, [*words, *resume])().data
     # Where nobody watches in the environment, the preset itself keeps the best, by a loss.
     made = trained(fitted, takes_best="watch" not in settings)
-    return {**made, "command": shlex.join(["dds", stage, *words])}
+    return {**made, "command": shlex.join(["dds", stage, *map(known_as, words)])}
 
 
 def evaluate(settings: Facts, how: Facts, reads: Reads, folder: Path, resuming: bool) -> Facts:

@@ -10,7 +10,7 @@ from typing import Any
 from jsonargparse import Namespace
 
 from datamodules.relabelling import Relabelling
-from dds_lightning.configs import RUN_DEFAULTS, run_defaults
+from dds_lightning.configs import RUN_DEFAULTS, known_as, run_defaults
 from dds_lightning.console.reports import Report
 from dds_lightning.errors import UserError
 from dds_lightning.pipeline.trial import refuse_settings
@@ -259,7 +259,7 @@ class Trainings:
 
     def command(self, stage: str, spec: str, skill: Path | None, resume: Path | None) -> str:
         """The command line that `fit` with the same arguments is."""
-        return shlex.join(["dds", stage, *self._words(stage, spec, skill, resume)])
+        return shlex.join(["dds", stage, *map(known_as, self._words(stage, spec, skill, resume))])
 
     def _words(self, stage: str, spec: str, skill: Path | None, resume: Path | None) -> list[str]:
         arguments = self.arguments(stage, spec, skill)
