@@ -16,7 +16,7 @@ def run(
     gpus: float = 0,
     minutes: int = 240,
     plan: bool = False,
-    known: list[str] | None = None,
+    known: list[str] | str | None = None,
 ) -> Report:
     """Run a study: every cell of a grid over tasks, methods, settings and seeds, then its report.
 
@@ -41,7 +41,7 @@ def run(
     """
     from dds_lightning.grid.run import Asked, run_study
 
-    places = [Path(one) for one in known or []]
+    places = [Path(one) for one in ([known] if isinstance(known, str) else known or [])]
     return run_study(Asked(file, Path(out), engine, workers, scale, cpus, gpus, minutes, plan, places))
 
 

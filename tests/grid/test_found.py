@@ -5,6 +5,7 @@ import json
 import pandas as pd
 import pytest
 
+from dds_lightning.cli import main
 from dds_lightning.errors import UserError
 from dds_lightning.grid.found import FILE, Found, Outcome, Work
 from dds_lightning.grid.report import report_study
@@ -47,6 +48,8 @@ def test_known_cells_are_not_done_again_and_are_in_the_report(tmp_path):
     done = run_study(Asked(file, out, known=[half / "report" / FILE, whole / "report"]))
     assert done.status == 0
     assert set(done.data["table"]["state"]) == {"done"}
+    for known in (str(whole / "report"), f"[{half / 'report'},{whole / 'report'}]"):
+        assert main(["study", "run", file, "--out", str(tmp_path / "new"), "--known", known, "--plan"]) == 0
     again = run_study(Asked(file, out, plan_only=True))
     assert again.data["jobs"] == {}, "what is known is remembered"
 
