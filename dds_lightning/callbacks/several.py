@@ -6,6 +6,7 @@ import lightning.pytorch as pl
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
+from dds_lightning.callbacks.guard import FiniteGuard
 from dds_lightning.errors import UserError
 from dds_lightning.module import StageModule
 
@@ -102,20 +103,20 @@ class SeveralUpdates(Callback):
         for name, value, fine in checks:
             if not fine:
                 raise UserError(f"several updates: {name} is {value}, which does not go with it: leave one of them out")
-        for callback in trainer.callbacks:
-            if getattr(callback, "decay", None):  # it does something at every step
-                name = type(callback).__name__
-                raise UserError(f"several updates: {name} looks at every step: give its decay as null or 0")
         steps = {"trainer.log_every_n_steps": trainer.log_every_n_steps}
         if not trainer.fast_dev_run:
             steps["trainer.max_steps"] = trainer.max_steps
         if isinstance(trainer.val_check_interval, int):
             steps["trainer.val_check_interval"] = trainer.val_check_interval
         for callback in trainer.callbacks:
-            if callback is not self and isinstance(every := getattr(callback, "every_n_steps", None), int):
-                steps[f"every_n_steps of {type(callback).__name__}"] = every
+            name = type(callback).__name__
+            if getattr(callback, "decay", None):  # it does something at every step
+                raise UserError(f"several updates: {name} looks at every step: give its decay as null or 0")
+            every = getattr(callback, "every_n_steps", None)
+            if isinstance(every, int) and not isinstance(callback, FiniteGuard):  # that one is asked at every step
+                steps[f"every_n_steps of {name}"] = every
         for name, value in steps.items():
-            if value % self.updates and not name.endswith("FiniteGuard"):
+            if value % self.updates:
                 raise UserError(
                     f"several updates: {name} is {value}, expected a multiple of the {self.updates} updates that are "
                     "taken at once"

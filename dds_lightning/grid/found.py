@@ -90,11 +90,8 @@ class Found:
 
     def only(self, works: Iterable[str]) -> Found:
         """Those of some jobs, by their keys."""
-        kept = set(works)
-        return Found(*({key: one for key, one in part.items() if key in kept} for part in self._parts()))
-
-    def _parts(self) -> tuple[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]]:
-        return self.works, self.outcomes, self.curves
+        kept, parts = set(works), (self.works, self.outcomes, self.curves)
+        return Found(*({key: one for key, one in part.items() if key in kept} for part in parts))  # type: ignore[arg-type]
 
     @classmethod
     def of_nodes(cls, root: Path, cells: Mapping[str, Iterable[str]]) -> Found:

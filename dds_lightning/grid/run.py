@@ -102,12 +102,11 @@ def do_nodes(asked: Asked, nodes: Mapping[str, Node], known: Found) -> dict[str,
     """
     console = Terminal(stderr=True)
     progress = Progress(0, 1)
-    done = set(known.outcomes)
+    here = _finished(asked, nodes)
+    done = here.keys() | known.outcomes.keys()
     for key, node in nodes.items():
-        if (found := finished(asked.out / NODES / key) or known.works.get(key)) is not None:
-            progress.past[node.kind].append(found.seconds)
-        if isinstance(found, Done):
-            done.add(key)
+        if (work := here.get(key) or known.works.get(key)) is not None:
+            progress.past[node.kind].append(work.seconds)
     todo = needed(nodes, done)
     progress.total = len(todo)
     console.print(f"{len(nodes)} jobs, {len(done)} of them done before, {len(todo)} to do")
@@ -149,6 +148,11 @@ def _table(study: Study, cells: Mapping[str, tuple[Cell, Node]], asked: Asked) -
     return {"format": 1, "study": asdict(study), "cells": rows, "command": command}
 
 
+def _finished(asked: Asked, nodes: Mapping[str, Node]) -> dict[str, Done]:
+    """What is done in this study's folder."""
+    return {key: done for key in nodes if (done := finished(asked.out / NODES / key)) is not None}
+
+
 def _known(asked: Asked, place: Path, nodes: Mapping[str, Node]) -> Found:
     """What this study's cells have found elsewhere: in the files that were given now, and when it was run before."""
     found = Found.load(place / KNOWN).only(nodes) if (place / KNOWN).is_file() else Found()
@@ -167,7 +171,7 @@ def _planned(
     asked: Asked, study: Study, cells: Mapping[str, tuple[Cell, Node]], nodes: Mapping[str, Node], known: Found
 ) -> Report:
     """What would be done."""
-    done = set(known.outcomes) | {key for key in nodes if finished(asked.out / NODES / key) is not None}
+    done = _finished(asked, nodes).keys() | known.outcomes.keys()
     kinds: dict[str, int] = {}
     for node in needed(nodes, done).values():
         kinds[node.kind] = kinds.get(node.kind, 0) + 1
