@@ -7,6 +7,8 @@ tasks: [pointmaze-large]
 seeds: [0, 1, 2]
 budget: 240                                  # core-minutes that the whole study may take; told, not enforced
 settings: {skill.trainer.max_steps: 2500}    # of every cell, STAGE.KEY as in `dds STAGE fit --KEY`
+task_settings:                               # of every cell of one task
+  pointmaze-large: {policy.trainer.max_steps: 4000}
 grid:                                        # every combination
   skill.model.num_skills: [4, 16]
 variants:                                    # or named departures, one at a time
@@ -67,8 +69,16 @@ BUDGETS = (
 """Settings of a stage that `--scale` multiplies."""
 _KEYS: dict[str, tuple[type, ...]] = {
     **{"title": (str,), "question": (str,), "tasks": (list,), "methods": (list, str), "seeds": (list,), "data": (str,)},
-    **{"preset": (str,), "budget": (int, float), "settings": (dict,), "grid": (dict,), "variants": (dict,)},
-    **{"watch": (int,), "rows": (list,), "columns": (list,), "labels": (dict,), "paper": (str,), "reference": (str,)},
+    **{"preset": (str,), "budget": (int, float), "settings": (dict,), "task_settings": (dict,), "grid": (dict,)},
+    **{
+        "variants": (dict,),
+        "watch": (int,),
+        "rows": (list,),
+        "columns": (list,),
+        "labels": (dict,),
+        "paper": (str,),
+        "reference": (str,),
+    },
 }
 
 
@@ -102,6 +112,7 @@ class Study:
 
     Attributes:
         data: Where the data are; None collects them, once for all seeds.
+        task_settings: Task -> settings of its cells.
         watch: Evaluations while the last stage trains, from which its best checkpoint is chosen; 0 for none.
         rows: Coordinates that name a row of the report's table: axes, `task`, `method` or `variant`.
         columns: Likewise.
@@ -120,6 +131,7 @@ class Study:
     preset: str | None = None
     budget: float | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
+    task_settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     grid: Mapping[str, list[Any]] = field(default_factory=dict)
     variants: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     watch: int = 0
@@ -137,7 +149,8 @@ class Study:
         for seed, task, method, chosen in itertools.product(self.seeds, self.tasks, self.methods, combinations):
             for variant, departure in variants.items():
                 place = {**chosen, **({"variant": variant} if variant else {})}
-                yield Cell(task, method, seed, place, {**self.settings, **chosen, **departure})
+                common = {**self.settings, **self.task_settings.get(task, {})}
+                yield Cell(task, method, seed, place, {**common, **chosen, **departure})
 
     def coordinates(self) -> list[str]:
         """Everything by which two cells may differ, beside the seed."""
@@ -199,7 +212,7 @@ def read_study(path: Path, scale: float = 1.0) -> Study:
         key: tuple(found.pop(key)) for key in ("tasks", "methods", "seeds", "rows", "columns") if key in found
     }
     numbers: dict[str, Any] = {
-        key: _numbers(found.pop(key)) for key in ("settings", "grid", "variants") if key in found
+        key: _numbers(found.pop(key)) for key in ("settings", "task_settings", "grid", "variants") if key in found
     }
     study = Study(**found, **lists, **numbers, scale=scale)
     try:
@@ -244,6 +257,12 @@ def _check(study: Study) -> None:
         raise UserError(
             f"data is {study.data} for {len(study.tasks)} tasks, expected one task, or none to collect data"
         )
+    for name, given in study.task_settings.items():
+        if name not in study.tasks:
+            near = did_you_mean(str(name), study.tasks) or f", expected some of {', '.join(study.tasks)}"
+            raise UserError(f"task_settings: {name} is no task of this study{near}")
+        if not isinstance(given, dict) or not given:
+            raise UserError(f"task_settings: {name} is {given!r}, expected settings, STAGE.KEY: value")
     if study.watch < 0:
         raise UserError(f"watch is {study.watch}, expected 0 (no evaluation while training) or more")
     for name, departure in study.variants.items():
@@ -265,7 +284,7 @@ def _check(study: Study) -> None:
 def _asked(study: Study) -> dict[str, list[Any]]:
     """Every setting that some cell is given, with its values."""
     asked: dict[str, list[Any]] = {}
-    for settings in (study.settings, *study.variants.values()):
+    for settings in (study.settings, *study.task_settings.values(), *study.variants.values()):
         for key, value in settings.items():
             asked.setdefault(key, []).append(value)
     for key, values in study.grid.items():

@@ -45,6 +45,19 @@ def test_a_setting_that_is_given_as_the_preset_has_it_changes_no_key(tmp_path):
     assert list(plan(plain)) != list(plan(study(tmp_path, settings={"skill.model.skill_dim": 32})))
 
 
+def test_a_task_has_settings_of_its_own_and_a_variant_still_departs_from_them(tmp_path):
+    found = study(
+        tmp_path,
+        tasks=[TASK, "hopper-medium-expert"],
+        settings={"policy.trainer.max_steps": 10},
+        task_settings={TASK: {"policy.trainer.max_steps": 20}},
+        variants={"longer": {"policy.trainer.max_steps": 30}},
+    )
+    steps = {(cell.task, cell.place["variant"]): cell.settings["policy.trainer.max_steps"] for cell in found.cells()}
+    runner = "hopper-medium-expert"
+    assert steps == {(TASK, "base"): 20, (TASK, "longer"): 30, (runner, "base"): 10, (runner, "longer"): 30}
+
+
 def test_scale_divides_every_budget(tmp_path):
     full, small = (
         {node.kind: node.settings for node in nodes(study(tmp_path, scale)).values()} for scale in (1.0, 0.01)
@@ -75,6 +88,12 @@ def test_packaged_studies_can_be_planned(name):
         ({"methods": ["ddss"]}, r"methods: there is no method ddss: did you mean dds"),
         ({"tasks": ["pointmaze-umase-diverse"]}, "pointmaze-umase-diverse"),
         ({"tasks": []}, "tasks is missing or empty"),
+        (
+            {"task_settings": {"pointmaze-umaze": {"skill.model.lr": 1e-3}}},
+            "pointmaze-umaze is no task of this study: did",
+        ),
+        ({"task_settings": {TASK: 3}}, f"task_settings: {TASK} is 3, expected settings"),
+        ({"task_settings": {TASK: {"skil.model.lr": 1}}}, "skil.model.lr is no setting: did you mean skill.model.lr"),
         ({"grid": {"skill.model.num_skills": []}}, r"skill.model.num_skills is \[\], expected a list of one or more"),
         ({"grid": {"skill.model.num_skills": [4, 8, 4]}}, "skill.model.num_skills holds 4 twice"),
         ({"seeds": [0, 0]}, "seeds holds 0 twice"),
