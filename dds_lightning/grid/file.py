@@ -60,6 +60,7 @@ OURS = (
 BUDGETS = (
     "trainer.max_steps",
     "trainer.val_check_interval",
+    "model.prior_steps",
     "model.critic_steps",  # a critic that never stops would leave the actor no step
     "model.freeze_codes_after",
     "model.warmup_steps",
