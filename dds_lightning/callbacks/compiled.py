@@ -44,8 +44,11 @@ class CompiledLoss(Callback):
                 "compiled loss: on a CPU it needs a C++ compiler (g++ or clang++), and none was found: install one, "
                 "or train without this callback"
             )
-        mode = self.mode if self.backend == "inductor" else None  # the others know none
-        compiled = torch.compile(own, backend=self.backend, mode=mode)
+        options: dict[str, Any] | None = None  # the other backends know none
+        if self.backend == "inductor":
+            # What torch draws for dropout is vectorised on a processor, and what the compiler would generate is not.
+            options = {**torch._inductor.list_mode_options(self.mode), "fallback_random": on_cpu}
+        compiled = torch.compile(own, backend=self.backend, options=options)
 
         def loss(batch: Any) -> Any:
             if not pl_module.training:

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from dds_lightning.nn.draws import normal
+from dds_lightning.nn.dropout import Dropout
 
 Sampler = Literal["ddpm", "ddim"]
 
@@ -38,7 +39,7 @@ class ResidualBlock(nn.Module):
         super().__init__()
         self.net = nn.Sequential(
             nn.LayerNorm(dim),
-            nn.Dropout(dropout),
+            Dropout(dropout),
             nn.Linear(dim, 4 * dim),
             nn.ReLU(),
             nn.Linear(4 * dim, dim),

@@ -13,6 +13,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pack_padded_sequence, pad_packed_sequence
 
+from dds_lightning.nn.dropout import Dropout
+
 
 def step_mask(lengths: Tensor, horizon: int) -> Tensor:
     """Mark the steps that were really taken: (B,) lengths to a (B, H) boolean mask."""
@@ -59,6 +61,7 @@ class TransformerEncoder(nn.Module):
         self.embedding = nn.Linear(input_dim, hidden_dim)
         self.positions = nn.Parameter(0.02 * torch.randn(horizon, hidden_dim))
         layer = nn.TransformerEncoderLayer(hidden_dim, heads, 4 * hidden_dim, dropout, batch_first=True)
+        layer.dropout = layer.dropout1 = layer.dropout2 = Dropout(dropout)
         self.layers = nn.TransformerEncoder(layer, layers, enable_nested_tensor=False)
         self.projection = projection(hidden_dim, output_dim)
 

@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from dds_lightning.nn.dropout import dropout
+
 
 def in_full_precision(x: Tensor) -> AbstractContextManager[Any]:
     """Inside a training in bfloat16, leave it for an operation on `x` whose last digits count.
@@ -99,9 +101,9 @@ class MLP(nn.Sequential):
         """Apply the layers."""
         *hidden, last = self
         for layer in hidden:
+            if isinstance(layer, nn.ReLU):  # no layer of its own, so that names in checkpoints stay
+                x = dropout(x, self.dropout, self.training)  # before it: the same numbers, and one mask less to keep
             x = layer(x)
-            if self.dropout and isinstance(layer, nn.ReLU):  # no layer of its own: names in checkpoints stay
-                x = nn.functional.dropout(x, self.dropout, self.training)
         with in_full_precision(x):
             out: Tensor = last(x.to(next(last.parameters()).dtype))
         return out

@@ -1,5 +1,7 @@
 """A compiled loss trains as the module's own does, for every stage, and leaves no trace in the module."""
 
+import shutil
+
 import lightning.pytorch as pl
 import pytest
 import torch
@@ -8,6 +10,7 @@ from torch.utils.data import DataLoader
 from dds_lightning import PolicyModule, SkillModule
 from dds_lightning.baselines.behaviour_cloning import BehaviourCloning
 from dds_lightning.callbacks import CompiledLoss, FiniteGuard
+from dds_lightning.callbacks.compiled import COMPILERS
 from dds_lightning.errors import UserError
 from dds_lightning.online.sac import SACModule
 from tests.modules import fit
@@ -53,6 +56,10 @@ STAGES = {
         lambda: PolicyModule(3, 4, hidden_dims=[8], extraction="joint", fourier_features=4, fourier_seen=2),
         lambda: transitions("codes"),
     ),
+    "policy with dropout": (
+        lambda: PolicyModule(3, 4, hidden_dims=[8], extraction="joint", dropout=0.5),
+        lambda: transitions("codes"),
+    ),
     "policy after": (
         lambda: PolicyModule(3, 4, hidden_dims=[8], extraction="after", critic_steps=2),
         lambda: transitions("codes"),
@@ -82,6 +89,23 @@ def test_it_trains_as_the_modules_own_loss_does(stage):
     for name, value in own.state_dict().items():
         torch.testing.assert_close(compiled.state_dict()[name], value, rtol=1e-4, atol=1e-5, msg=name)
     assert torch._dynamo.utils.counters["stats"]["unique_graphs"] > 0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not any(map(shutil.which, COMPILERS)), reason="needs a C++ compiler")
+def test_the_compilers_code_draws_what_torch_draws():
+    make, data = STAGES["policy with dropout"]
+    own, compiled, other = (train(make, data, *more) for more in ([], [CompiledLoss()], [OtherDraws(), CompiledLoss()]))
+    for name, value in own.actor.state_dict().items():
+        torch.testing.assert_close(compiled.actor.state_dict()[name], value, rtol=1e-4, atol=1e-5, msg=name)
+    assert not torch.allclose(other.actor[0].weight, own.actor[0].weight, rtol=1e-4, atol=1e-5)
+
+
+class OtherDraws(pl.Callback):
+    """So that the test above notices other masks."""
+
+    def on_train_start(self, trainer, pl_module):
+        torch.manual_seed(1)
 
 
 def test_a_machine_without_a_compiler_is_told(monkeypatch):
