@@ -16,7 +16,7 @@ class CompiledLoss(Callback):
     """Compile the module's loss, forward and backward, with `torch.compile`; networks and checkpoints stay as they are.
 
     Operations between matrix products are fused, so rounding differs a little from a training without it. Worth it for
-    small networks in bfloat16 (`benchmarks/LOG.md`), and made for GPUs, where mode ``reduce-overhead`` replays a step
+    policies, not for clones (`benchmarks/results/bench.md`), and made for GPUs, where mode ``reduce-overhead`` replays a step
     as CUDA graphs. The first step takes up to a minute.
 
     Args:
