@@ -16,8 +16,8 @@ class CompiledLoss(Callback):
     """Compile the module's loss, forward and backward, with `torch.compile`; networks and checkpoints stay as they are.
 
     Operations between matrix products are fused, so rounding differs a little from a training without it. Worth it for
-    policies, not for clones (`benchmarks/results/bench.md`), and made for GPUs, where mode ``reduce-overhead`` replays a step
-    as CUDA graphs. The first step takes up to a minute.
+    policies, not for clones (`benchmarks/results/bench.md`), and made for GPUs, where mode ``reduce-overhead`` replays
+    a step as CUDA graphs. The first step takes up to a minute.
 
     Args:
         mode: Of `torch.compile`; the last three take minutes to try out kernels, or need a GPU.
