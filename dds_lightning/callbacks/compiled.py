@@ -1,6 +1,7 @@
 """Compile the loss of a training."""
 
 import shutil
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from typing import Any, Literal
 
 import lightning.pytorch as pl
@@ -12,12 +13,23 @@ from dds_lightning.errors import UserError
 COMPILERS = ("g++", "clang++", "c++")
 
 
+def recomputed_masks() -> AbstractContextManager[Any]:
+    """Code compiled in here computes ReLU's masks in the backward pass, where the compiler would keep them as booleans.
+
+    Its code is slow to write booleans on a processor: a clone takes 410 steps a second in place of 155.
+    """
+    import torch._functorch.config as settings
+
+    name = "ban_recompute_materialized_backward"
+    return settings.patch({name: False}) if hasattr(settings, name) else nullcontext()
+
+
 class CompiledLoss(Callback):
     """Compile the module's loss, forward and backward, with `torch.compile`; networks and checkpoints stay as they are.
 
     Operations between matrix products are fused, so rounding differs a little from a training without it. Worth it for
-    policies, not for clones (`benchmarks/results/bench.md`), and made for GPUs, where mode ``reduce-overhead`` replays
-    a step as CUDA graphs. The first step takes up to a minute.
+    small networks (`benchmarks/results/bench.md`), and made for GPUs, where mode ``reduce-overhead`` replays a step as
+    CUDA graphs. The first step takes up to a minute.
 
     Args:
         mode: Of `torch.compile`; the last three take minutes to try out kernels, or need a GPU.
@@ -30,6 +42,7 @@ class CompiledLoss(Callback):
         backend: Literal["inductor", "cudagraphs", "aot_eager"] = "inductor",
     ) -> None:
         self.mode, self.backend = mode, backend
+        self._masks = ExitStack()
 
     def on_fit_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Put the compiled loss before the module's own, which validation goes on using.
@@ -57,7 +70,9 @@ class CompiledLoss(Callback):
             return compiled(batch)
 
         pl_module.loss = loss  # type: ignore[assignment]
+        self._masks.enter_context(recomputed_masks())  # compiled at the first step, and again where shapes change
 
     def teardown(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
-        """Give the module its own loss back."""
+        """Give the module its own loss back, and the compiler its settings."""
         pl_module.__dict__.pop("loss", None)
+        self._masks.close()

@@ -108,6 +108,23 @@ class OtherDraws(pl.Callback):
         torch.manual_seed(1)
 
 
+def test_the_compilers_settings_are_as_before():
+    import torch._functorch.config as settings
+
+    if not hasattr(settings, "ban_recompute_materialized_backward"):
+        pytest.skip("this torch has no such setting")
+    make, data = STAGES["clone"]
+    before, seen = settings.ban_recompute_materialized_backward, []
+
+    class Look(pl.Callback):
+        def on_train_batch_end(self, *_):
+            seen.append(settings.ban_recompute_materialized_backward)
+
+    train(make, data, CompiledLoss(backend="aot_eager"), Look())
+    assert (before, set(seen)) == (True, {False})
+    assert settings.ban_recompute_materialized_backward == before
+
+
 def test_a_machine_without_a_compiler_is_told(monkeypatch):
     monkeypatch.setenv("PATH", "")
     make, data = STAGES["clone"]
