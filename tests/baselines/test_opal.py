@@ -105,7 +105,7 @@ def test_they_find_the_mode_that_pays(kind, settings, skills, tmp_path):
     train(module, data, 500)
     module.trainer.save_checkpoint(tmp_path / "last.ckpt")
     agent = METHODS[kind.STAGE].play({"skill": skills, kind.STAGE: str(tmp_path / "last.ckpt")})
-    assert regret(agent) < 0.15
+    assert regret(agent) < 0.3  # imitation has 0.6; of five seeds LDCQ had 0.11 to 0.24 on one processor
 
 
 def test_discrete_skills_are_refused(tmp_path):
