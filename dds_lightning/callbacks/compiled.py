@@ -70,7 +70,8 @@ class CompiledLoss(Callback):
             return compiled(batch)
 
         pl_module.loss = loss  # type: ignore[assignment]
-        self._masks.enter_context(recomputed_masks())  # compiled at the first step, and again where shapes change
+        if on_cpu:  # until teardown: compiled at the first step, and again where shapes change
+            self._masks.enter_context(recomputed_masks())
 
     def teardown(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
         """Give the module its own loss back, and the compiler its settings."""

@@ -94,7 +94,7 @@ def test_the_actions_of_the_data_are_the_encoders_means(skills):
     assert next(iter(loader))["rewards"].item() == pytest.approx(rewards, rel=1e-5)
 
 
-SMALL = {"prior_steps": 250, "samples": 8, "backup_samples": 4, "hidden_dim": 32, "blocks": 2, "diffusion_steps": 5}
+SMALL = {"prior_steps": 250, "samples": 32, "backup_samples": 4, "hidden_dim": 32, "blocks": 2, "diffusion_steps": 5}
 
 
 @pytest.mark.parametrize(("kind", "settings"), [(OPAL, {"beta": 3.0}), (LDCQ, SMALL)])
@@ -105,7 +105,7 @@ def test_they_find_the_mode_that_pays(kind, settings, skills, tmp_path):
     train(module, data, 500)
     module.trainer.save_checkpoint(tmp_path / "last.ckpt")
     agent = METHODS[kind.STAGE].play({"skill": skills, kind.STAGE: str(tmp_path / "last.ckpt")})
-    assert regret(agent) < 0.3  # imitation has 0.6; of five seeds LDCQ had 0.11 to 0.24 on one processor
+    assert regret(agent) < 0.15
 
 
 def test_discrete_skills_are_refused(tmp_path):
