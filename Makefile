@@ -27,7 +27,7 @@ $(VENV)/.notebooks: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --editable '.[dev,notebooks]' --constraint $(CONSTRAINTS)
 	@touch $@
 
-demo: $(VENV)/.installed  ## all stages on PointMaze-Large, five to seven minutes on two cores
+demo: $(VENV)/.installed  ## all stages on PointMaze-Large, three to seven minutes on two cores
 	$(BIN)/dds run $(TASK) --seed $(SEED)
 
 test: $(VENV)/.installed  ## the test suite
