@@ -1,5 +1,6 @@
 """The report of a study, from results made up by hand: its tables, its intervals, its page."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +17,13 @@ from dds_lightning.grid.report import report_study
 from dds_lightning.grid.results import Results
 from dds_lightning.grid.run import CELLS, Asked, _table
 from dds_lightning.rollout.result import RolloutResult
-from dds_lightning.saving.run_directory import RunDirectory, write_json
+from dds_lightning.saving.run_directory import MARKER, RunDirectory, write_json
 
 TASK = "pointmaze-large-diverse"
 SCORES = {(32, 4): (10, 20, 30), (32, 8): (40, 50, 60), (64, 4): (50, 50, 50), (64, 8): (90, 95, 100)}
 """(D, K) -> score of each seed."""
+SECONDS = 1.5
+"""How long each made-up job is said to have taken: in truth none takes as much as a hundredth of a second."""
 
 
 def evaluation(scores):
@@ -68,6 +71,8 @@ def made(tmp_path, best=False, left_out=(), **keys):
             if one.kind == "evaluate" and index in left_out:
                 continue
             directory.do(one.key, one.title, one.settings, [], work if one.kind == "evaluate" else training)
+            marker = root / one.key / MARKER
+            write_json(marker, {**json.loads(marker.read_text()), "seconds": SECONDS})
             write_json(
                 root / one.key / MADE, {"versions": {"torch": "2.13"}, "commit": "abc123", "machine": "x, 2 cores"}
             )
