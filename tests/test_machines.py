@@ -69,7 +69,7 @@ def test_without_fcntl_a_run_works_and_is_told(monkeypatch):
 
 def test_a_directory_that_is_locked_is_refused():
     second = run_directory.locked(Path("run"))
-    with run_directory.locked(Path("run")), pytest.raises(UserError, match="another `dds run`"), second:
+    with run_directory.locked(Path("run")), pytest.raises(UserError, match="another run or study"), second:
         pass
 
 
