@@ -41,16 +41,20 @@ def run(
     """
     from dds_lightning.grid.run import Asked, run_study
 
-    places = [Path(one) for one in ([known] if isinstance(known, str) else known or [])]
-    return run_study(Asked(file, Path(out), engine, workers, scale, cpus, gpus, minutes, plan, places))
+    return run_study(Asked(file, Path(out), engine, workers, scale, cpus, gpus, minutes, plan, _places(known)))
 
 
-def report(directory: str) -> Report:
+def report(directory: str, known: list[str] | str | None = None) -> Report:
     """Write the report of a study again: one page to keep, and Markdown; a study that is not finished has one too.
 
     Args:
         directory: Folder of the study in the folder that `dds study run` wrote, for example runs/study/table2.
+        known: `results.json` of reports, or their folders: cells that other machines have done join this report.
     """
     from dds_lightning.grid.report import report_study
 
-    return report_study(Path(directory))
+    return report_study(Path(directory), _places(known))
+
+
+def _places(given: list[str] | str | None) -> list[Path]:
+    return [Path(one) for one in ([given] if isinstance(given, str) else given or [])]

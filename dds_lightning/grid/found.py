@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -214,3 +214,26 @@ def _curve(root: Path, keys: Iterable[str]) -> pd.DataFrame | None:
         return None
     table = table.drop_duplicates("step", keep="last").rename(columns={"online/env_steps": "env_steps", value: "value"})
     return table[["env_steps", "value"]].dropna().sort_values("env_steps")
+
+
+def found_elsewhere(remembered: Path, given: Iterable[Path], jobs: Collection[str]) -> Found:
+    """What reports of other folders or machines hold of a study.
+
+    Args:
+        remembered: What the study's folder knows already, if the file is there.
+        given: `results.json` of reports, or their folders.
+        jobs: Keys of the study's jobs; nothing else is taken over.
+
+    Raises:
+        UserError: A file is missing or damaged, or a report has no cell of this study.
+    """
+    found = Found.load(remembered).only(jobs) if remembered.is_file() else Found()
+    for file in given:
+        there = Found.load(file / FILE if file.is_dir() else file).only(jobs)
+        if not there.outcomes:
+            raise UserError(
+                f"--known: {file} has no cell of this study: its task, settings, seeds or preset are other ones; leave "
+                "it out"
+            )
+        found |= there
+    return found

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import pandas as pd
 from dds_lightning.console.reports import Report, table
 from dds_lightning.grid import figures
 from dds_lightning.grid.found import FILE as FOUND
-from dds_lightning.grid.results import PULLS, Results
+from dds_lightning.grid.results import PULLS, Results, remember
 from dds_lightning.saving.files import written_whole
 from dds_lightning.saving.run_directory import duration
 from dds_lightning.saving.templates import render
@@ -43,12 +44,18 @@ class Section:
     commands: list[tuple[str, list[str]]] = field(default_factory=list)
 
 
-def report_study(place: Path) -> Report:
+def report_study(place: Path, known: Sequence[Path] = ()) -> Report:
     """Write `report/` in a study's folder, and return what is in it; a study that is not finished has one too.
 
+    Args:
+        place: The study's folder.
+        known: Reports of other folders or machines whose cells are taken over, and remembered there.
+
     Raises:
-        UserError: No study is there, or a file is damaged.
+        UserError: No study is there, a file is damaged, or a report has no cell of this study.
     """
+    if known:
+        remember(place, known)
     results = Results.read(place)
     sections, folder = _sections(results), place / "report"
     pictures = {section.name: _png(section.figure) for section in sections if section.figure is not None}

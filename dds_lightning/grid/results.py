@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,17 +13,47 @@ from numpy.typing import NDArray
 
 from dds_lightning.errors import UserError
 from dds_lightning.grid.file import BASE, PLAYERS
-from dds_lightning.grid.found import Found, check_key
+from dds_lightning.grid.found import Found, check_key, found_elsewhere
 from dds_lightning.grid.job import NODES
 from dds_lightning.saving.untrusted import TEXT, conform, mapping, parsing, read_json
 from dds_lightning.study.paper import number_of
 from dds_lightning.study.protocol import BEST, LAST
 from dds_lightning.study.statistics import evaluation_curve, interval, mean_std, probability_of_improvement
 
+CELLS = "cells.json"
+"""The cells of a study, in its folder."""
 KNOWN = "known.json"
 """What was found elsewhere, in a study's folder."""
 PULLS = 100
 """Evaluation episodes that the curve of `evaluation_curve` goes up to."""
+
+
+REMEDY = "run the study again"
+
+
+def remember(place: Path, known: Iterable[Path]) -> None:
+    """Keep in a study's folder what reports from elsewhere hold of its cells, beside what it was told before.
+
+    Args:
+        place: The study's folder.
+        known: `results.json` of reports, or their folders.
+
+    Raises:
+        UserError: No study is there, a file is damaged, or a report has no cell of this study.
+    """
+    _, jobs = _cells(place)
+    found_elsewhere(place / KNOWN, known, {key for keys in jobs.values() for key in keys}).save(place / KNOWN)
+
+
+def _cells(place: Path) -> tuple[Mapping[str, Any], dict[str, list[str]]]:
+    """What a study's folder says about its cells; key of a cell -> keys of the jobs that it is made of."""
+    file = place / CELLS
+    if not file.is_file():
+        raise UserError(f"{place} holds no study: there is no {file.name}; give OUT/NAME of `dds study run`")
+    with parsing(file, REMEDY):
+        read = mapping(read_json(file, 64 * TEXT, root=place), file)
+        conform(read, {"study": (dict,), "cells": (list,), "command": (str,)}, str(file))
+        return read, {cell["key"]: [check_key(key, file) for key in cell["nodes"]] for cell in read["cells"]}
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,21 +83,12 @@ class Results:
         Raises:
             UserError: No study is there, or a file is damaged.
         """
-        file = place / "cells.json"
-        if not file.is_file():
-            raise UserError(f"{place} holds no study: there is no {file.name}; give OUT/NAME of `dds study run`")
-        with parsing(file, "run the study again"):
-            return cls._read(place, file)
-
-    @classmethod
-    def _read(cls, place: Path, file: Path) -> Results:
-        read = mapping(read_json(file, 64 * TEXT, root=place), file)
-        conform(read, {"study": (dict,), "cells": (list,), "command": (str,)}, str(file))
-        cells = {cell["key"]: [check_key(key, file) for key in cell["nodes"]] for cell in read["cells"]}
-        found = Found.load(place / KNOWN) if (place / KNOWN).is_file() else Found()
-        found |= Found.of_nodes(place.parent / NODES, cells)
-        table = pd.DataFrame([_row(cell, found) for cell in read["cells"]])
-        return cls(place, dict(read["study"]), read["command"], table, found)
+        record, jobs = _cells(place)
+        with parsing(place / CELLS, REMEDY):
+            found = found_elsewhere(place / KNOWN, (), {key for keys in jobs.values() for key in keys})
+            found |= Found.of_nodes(place.parent / NODES, jobs)
+            table = pd.DataFrame([_row(cell, found) for cell in record["cells"]])
+            return cls(place, dict(record["study"]), record["command"], table, found)
 
     @property
     def seconds(self) -> float:

@@ -23,15 +23,12 @@ from dds_lightning.envs.pool import available_cores
 from dds_lightning.errors import UserError
 from dds_lightning.grid.engines import ENGINES, Engine, Local, RayTasks, Slurm
 from dds_lightning.grid.file import Cell, Study, find_study, read_study
-from dds_lightning.grid.found import FILE as FOUND
-from dds_lightning.grid.found import Found
+from dds_lightning.grid.found import Found, found_elsewhere
 from dds_lightning.grid.job import NODES
 from dds_lightning.grid.loop import Progress, run_nodes
 from dds_lightning.grid.nodes import Node, in_order, needed, plan
-from dds_lightning.grid.results import KNOWN
+from dds_lightning.grid.results import CELLS, KNOWN
 from dds_lightning.saving.run_directory import Done, duration, finished, locked, write_json
-
-CELLS = "cells.json"
 
 
 @dataclass(frozen=True)
@@ -68,7 +65,7 @@ def run_study(asked: Asked) -> Report:
     cells = plan(study)
     nodes = in_order(node for _, node in cells.values())
     place = asked.out / (path.stem if study.scale == 1 else f"{path.stem}@{study.scale:g}")
-    known = _known(asked, place, nodes)
+    known = found_elsewhere(place / KNOWN, asked.known, nodes)
     if asked.plan_only:
         return _planned(asked, study, cells, nodes, known)
     with locked(asked.out):
@@ -151,20 +148,6 @@ def _table(study: Study, cells: Mapping[str, tuple[Cell, Node]], asked: Asked) -
 def _finished(asked: Asked, nodes: Mapping[str, Node]) -> dict[str, Done]:
     """What is done in this study's folder."""
     return {key: done for key in nodes if (done := finished(asked.out / NODES / key)) is not None}
-
-
-def _known(asked: Asked, place: Path, nodes: Mapping[str, Node]) -> Found:
-    """What this study's cells have found elsewhere: in the files that were given now, and when it was run before."""
-    found = Found.load(place / KNOWN).only(nodes) if (place / KNOWN).is_file() else Found()
-    for file in asked.known:
-        given = Found.load(file / FOUND if file.is_dir() else file).only(nodes)
-        if not given.outcomes:
-            raise UserError(
-                f"--known: {file} has no cell of this study: its task, settings, seeds or preset are other ones; leave "
-                "it out"
-            )
-        found |= given
-    return found
 
 
 def _planned(

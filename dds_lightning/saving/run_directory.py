@@ -220,7 +220,7 @@ def _lock(file: IO[bytes], root: Path) -> None:
 
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        raise UserError(f"out: another run or study is working in {root}: wait for it, or choose another --out") from None
+        raise UserError(f"out: another run or study works in {root}: wait for it, or choose another --out") from None
     except ImportError:
         reason = "this system has none"
     except OSError as error:

@@ -54,6 +54,23 @@ def test_known_cells_are_not_done_again_and_are_in_the_report(tmp_path):
     assert again.data["jobs"] == {}, "what is known is remembered"
 
 
+def test_reports_of_several_machines_become_one(tmp_path):
+    whole, first, second = (
+        made(tmp_path / name, left_out=left_out)
+        for name, left_out in {"whole": (), "one": range(6, 12), "two": range(6)}.items()
+    )
+    report_study(whole)
+    report_study(second)
+    assert main(["study", "report", str(first), "--known", str(second / "report")]) == 0
+    texts = [(place / "report" / "report.md").read_text() for place in (whole, first)]
+    assert texts[0].replace(str(tmp_path / "whole"), str(tmp_path / "one")) == texts[1]
+    assert set(Results.read(first).cells["state"]) == {"done"}, "what was taken over is remembered"
+    other = made(tmp_path / "other", grid={"skill.model.skill_dim": [16], "skill.model.num_skills": [2, 3]})
+    report_study(other)
+    with pytest.raises(UserError, match="has no cell of this study"):
+        report_study(first, [other / "report"])
+
+
 def test_a_curve_of_online_training_survives_the_file(tmp_path):
     curve = pd.DataFrame({"env_steps": [1000.0, 2000.0], "value": [0.1, 0.5]})
     made_by = {"versions": {"torch": "2.13"}, "commit": None, "machine": "x"}

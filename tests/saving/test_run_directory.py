@@ -119,7 +119,7 @@ def test_fresh_does_everything_again(script):
 
 def test_two_runs_cannot_share_a_directory(tmp_path):
     second = locked(tmp_path / "run")
-    with locked(tmp_path / "run"), pytest.raises(UserError, match="another run or study is working"):
+    with locked(tmp_path / "run"), pytest.raises(UserError, match="another run or study works"):
         second.__enter__()
 
 
