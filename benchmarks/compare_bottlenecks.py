@@ -64,9 +64,8 @@ def train(
     run: RunDirectory, name: str, task: Task, spec: str, reads: list[Done], settings: list[str], steps: int
 ) -> Path:
     """Train one model, unless that is already done; return its checkpoint."""
-    from dds_lightning.training.stage_cli import StageCLI, quieten
+    from dds_lightning.training.stage_cli import command
 
-    quieten()
     args = [*settings, f"--data.task={task.name}", f"--data.data={spec}", f"--model.skill_dim={DIM}"]
     args += [f"--trainer.max_steps={steps}", f"--trainer.precision={PRECISION}"]
 
@@ -75,7 +74,7 @@ def train(
         last = folder / "last.ckpt"
         resume = [f"--ckpt_path={last}"] if resuming and last.is_file() else []
         fit = ["fit", "--config", f"{task.family}/skill.yaml", *args, *folders, "--trainer.enable_model_summary=false"]
-        return {"checkpoint": Path(StageCLI("skill", [*fit, *resume]).execute().data["checkpoint"])}
+        return {"checkpoint": Path(command("skill", [*fit, *resume])().data["checkpoint"])}
 
     done = run.do(name, f"{name}: {steps:,} steps", {"words": sorted(args)}, reads, work)
     return done.outputs["checkpoint"]

@@ -27,3 +27,19 @@ def test_the_benchmark_for_a_gpu_runs_on_a_processor(monkeypatch, tmp_path, caps
     assert len(table) == 3
     assert (table["steps_per_s"] > 0).all()
     assert (tmp_path / "accelerator.md").read_text().strip() == capsys.readouterr().out.strip()
+
+
+def test_discrete_and_continuous_skills_are_compared(monkeypatch, tmp_path, dds):
+    """It had not run since trainings are built before they are executed."""
+    from benchmarks import compare_bottlenecks
+
+    words = ["pointmaze-large-diverse", "--steps", "3000", "--out", tmp_path, "--workers", "1"]
+    assert dds("data", "collect", *words).status == 0
+    asked = ["--data", f"local:{tmp_path}/pointmaze-large-diverse-v0", "--skills", "2", "--seeds", "1", "--steps", "2"]
+    monkeypatch.setattr(sys, "argv", ["compare_bottlenecks.py", *asked, "--out", str(tmp_path / "out")])
+    monkeypatch.setattr(compare_bottlenecks, "STATES", 4)
+    compare_bottlenecks.main()
+    models = pd.read_csv(tmp_path / "out" / "models-2.csv")
+    assert models["seed"].tolist() == [0, 0]
+    assert (models["chance"] >= 0.5).all()
+    assert (tmp_path / "out" / "comparison-2.png").is_file()
