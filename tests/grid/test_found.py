@@ -11,7 +11,7 @@ from dds_lightning.grid.found import FILE, Found, Outcome, Work
 from dds_lightning.grid.report import report_study
 from dds_lightning.grid.results import Results
 from dds_lightning.grid.run import Asked, run_study
-from tests.grid.test_report import SECONDS, made
+from tests.grid.test_report import LONG, SECONDS, made
 
 KEY = "evaluate-0123456789abcdef"
 
@@ -114,3 +114,14 @@ def test_results_of_another_study_are_refused(tmp_path):
     with pytest.raises(UserError, match="is not there"):
         run_study(Asked(str(other.parent / "mine.yaml"), tmp_path / "c", known=[tmp_path / "none.json"]))
     assert not (tmp_path / "c").exists()
+
+
+def test_a_command_stays_whole_and_in_one_line(tmp_path):
+    path = tmp_path / FILE
+    work = Work(1.0, f"dds fit {LONG}", "", None, None)
+    Found({KEY: work}, {KEY: Outcome({"last": 1.0}, pd.Series([1.0]).to_numpy())}, {}).save(path)
+    assert Found.load(path).works == {KEY: work}
+    value = json.loads(path.read_text())
+    value["nodes"][KEY]["command"] = "dds\n```\n# Fit\x1b[2J"
+    path.write_text(json.dumps(value))
+    assert Found.load(path).works[KEY].command == "dds# Fit[2J"

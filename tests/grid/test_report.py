@@ -22,6 +22,10 @@ from dds_lightning.saving.run_directory import MARKER, RunDirectory, write_json
 TASK = "pointmaze-large-diverse"
 SCORES = {(32, 4): (10, 20, 30), (32, 8): (40, 50, 60), (64, 4): (50, 50, 50), (64, 8): (90, 95, 100)}
 """(D, K) -> score of each seed."""
+LONG = (
+    "--trainer.callbacks+='" + '{"class_path": "dds_lightning.callbacks.RolloutEvaluation", "init_args": {}}' * 4 + "'"
+)
+"""What a command may look like: quotes, braces, and more than two hundred characters."""
 SECONDS = 1.5
 """How long each made-up job is said to have taken: in truth none takes as much as a hundredth of a second."""
 
@@ -48,7 +52,7 @@ def evaluation(scores):
 def training(folder, resuming):
     (folder / "last.ckpt").write_text("weights")
     chosen = {"monitor": "rollout/score", "step": 600, "value": 1.0, "evaluations": 4}
-    return {"checkpoint": folder / "last.ckpt", "chosen": chosen, "command": f"dds fit {folder.name}"}
+    return {"checkpoint": folder / "last.ckpt", "chosen": chosen, "command": f"dds fit {folder.name} {LONG}"}
 
 
 def made(tmp_path, best=False, left_out=(), **keys):
