@@ -32,7 +32,7 @@ WORK: Mapping[str, Any] = {
     "horizon": (int, type(None)),
     "made": (int, type(None)),
 }
-"""The form of a finished job in the file, its `command` apart; `made` is a place in the file's list of what made them."""
+"""The form of a finished job in the file, without its `command`; `made` is a place in the file's list of makers."""
 LONGEST = 10_000
 """Characters of a command."""
 
