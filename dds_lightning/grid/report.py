@@ -129,6 +129,9 @@ def _statistics(results: Results) -> list[Section]:
             "and the probability that a run of the setting beats one of the reference. With few seeds an interval is "
             "no more than the range of what was seen: settings whose intervals overlap are not told apart here."
         )
+        compared = list(next(iter(groups.values())))
+        if len(compared) < results.cells["task"].nunique():
+            told += f" Compared on {', '.join(compared)} alone: the other tasks are not finished."
         numbers = comparison.round(2)
         sections.append(Section("Is it real?", [told], numbers, figures.plot_intervals(comparison), "intervals"))
         sections.append(Section("Performance profiles", [], None, figures.plot_profiles(groups), "profiles"))

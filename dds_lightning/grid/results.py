@@ -137,12 +137,22 @@ class Results:
         return pd.DataFrame(list(lines.values())).fillna("-")
 
     def groups(self) -> dict[str, pd.DataFrame]:
-        """What is compared: name -> (seeds, tasks) scores of every setting that has all its cells."""
+        """What is compared: name -> (seeds, tasks) scores of every setting that has all its cells.
+
+        While fewer than two settings have, of the tasks whose cells are all done.
+        """
+        found = self._groups(self.cells)
+        if len(found) > 1:
+            return found
+        done = self.cells.groupby("task")["score"].transform(lambda scores: scores.notna().all())
+        return self._groups(self.cells[done]) or found
+
+    def _groups(self, cells: pd.DataFrame) -> dict[str, pd.DataFrame]:
         axes = [axis for axis in (*self.layout()[0], *self.layout()[1]) if axis != "task"]
         found: dict[str, pd.DataFrame] = {}
-        for chosen, part in self.cells.groupby(axes, sort=False, dropna=False) if axes else [((), self.cells)]:
+        for chosen, part in cells.groupby(axes, sort=False, dropna=False) if axes else [((), cells)]:
             name = self.name(dict(zip(axes, chosen, strict=True)))
-            scores = part.pivot_table(index="seed", columns="task", values="score", sort=False)
+            scores = part.pivot(index="seed", columns="task", values="score")[part["task"].unique()]
             if len(scores) and not scores.isna().any(axis=None):
                 found[name or "all"] = scores
         return found

@@ -106,6 +106,22 @@ def test_settings_are_compared_by_intervals_with_the_first(tmp_path):
     assert better[1:] == [1, 1, 1]
 
 
+def test_settings_are_compared_on_the_tasks_that_are_finished(tmp_path):
+    tasks = [TASK, "pointmaze-medium-diverse"]
+    second = [index for index in range(24) if index // 4 % 2]  # four settings on a task, then on the other, by seed
+    place = made(tmp_path, tasks=tasks, left_out=second[1:])
+    results = Results.read(place)
+    assert results.cells["score"].notna().sum() == 13
+    assert [list(scores) for scores in results.groups().values()] == [[TASK]] * 4
+    report_study(place)
+    text = (place / "report" / "report.md").read_text()
+    assert f"Compared on {TASK} alone: the other tasks are not finished." in text
+    whole = made(tmp_path / "whole", tasks=tasks)
+    assert [list(scores) for scores in Results.read(whole).groups().values()] == [tasks] * 4
+    report_study(whole)
+    assert "are not finished" not in (whole / "report" / "report.md").read_text()
+
+
 def test_each_setting_is_judged_over_all_values_of_the_others(tmp_path):
     table = Results.read(made(tmp_path)).effects()
     assert table["setting"].tolist() == ["D", "D", "K", "K"]
