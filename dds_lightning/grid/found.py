@@ -28,11 +28,12 @@ KEY = re.compile(r"[a-z0-9_]+-[0-9a-f]{16}")
 REMEDY = "give the `results.json` that `dds study run` wrote into a report"
 WORK: Mapping[str, Any] = {
     "seconds": (int, float),
+    "command": (str, type(None)),
     "chosen": (str,),
     "horizon": (int, type(None)),
     "made": (int, type(None)),
 }
-"""The form of a finished job in the file, without its `command`; `made` is a place in the file's list of makers."""
+"""The form of a finished job in the file; `made` is a place in the file's list of what results were made by."""
 LONGEST = 10_000
 """Characters of a command."""
 
@@ -148,7 +149,7 @@ class Found:
             for key, entry in value["nodes"].items():
                 one = conform(entry, WORK, f"{path}, nodes, {check_key(key, path)}")
                 by = made[one["made"]] if one["made"] is not None else None
-                works[key] = Work(one["seconds"], _command(one.get("command")), one["chosen"], one["horizon"], by)
+                works[key] = Work(one["seconds"], _command(entry.get("command")), one["chosen"], one["horizon"], by)
             for key, entry in value["cells"].items():
                 what = f"{path}, cells, {check_key(key, path)}"
                 one = conform(entry, {"scores": {LAST: (int, float)}, "episodes": (list,)}, what)
@@ -217,11 +218,11 @@ def _curve(root: Path, keys: Iterable[str]) -> pd.DataFrame | None:
     return table[["env_steps", "value"]].dropna().sort_values("env_steps")
 
 
-def _command(given: Any) -> str | None:
+def _command(given: str | None) -> str | None:
     """A command out of a file that anybody may have written: one line to show, whole, with its quotes and braces."""
     if given is None:
         return None
-    return "".join(letter for letter in str(given)[:LONGEST] if letter.isprintable() and letter != "`")
+    return "".join(letter for letter in given[:LONGEST] if letter.isprintable() and letter != "`")
 
 
 def found_elsewhere(remembered: Path, given: Iterable[Path], jobs: Collection[str]) -> Found:

@@ -139,7 +139,7 @@ class Results:
     def groups(self) -> dict[str, pd.DataFrame]:
         """What is compared: name -> (seeds, tasks) scores of every setting that has all its cells.
 
-        While fewer than two settings have, of the tasks whose cells are all done.
+        While fewer than two have them, only tasks whose cells are all done count.
         """
         found = self._groups(self.cells)
         if len(found) > 1:

@@ -92,6 +92,7 @@ def test_a_curve_of_online_training_survives_the_file(tmp_path):
         (lambda v: v | {"cells": []}, "cells is"),
         (lambda v: v | {"nodes": {"../../x": {}}}, "is no name of a job"),
         (lambda v: v | {"nodes": {KEY: {"seconds": "long"}}}, "seconds is 'long'"),
+        (lambda v: v | {"nodes": {KEY: {"seconds": 1, "command": ["dds"]}}}, "command is"),
         (lambda v: v | {"cells": {KEY: {"scores": {}, "episodes": []}}}, "last is"),
         (lambda v: v | {"curves": {KEY: {"a": [1]}}}, "a curve has other columns"),
         (lambda v: [], "holds a list"),
