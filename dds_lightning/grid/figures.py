@@ -27,6 +27,11 @@ def _axes(x: str, y: str, size: tuple[float, float] = (6.4, 3.6)) -> tuple[Figur
     return figure, axes
 
 
+def _style(index: int) -> str:
+    """Of a line: dashed where the colours begin again."""
+    return "-" if index < COLOURS else "--"
+
+
 def plot_horizon(cells: pd.DataFrame) -> Figure:
     """Figure 6: score over the horizon H, and where fewer steps were executed than learnt.
 
@@ -81,20 +86,20 @@ def plot_intervals(comparison: pd.DataFrame) -> Figure:
 
 def plot_profiles(groups: Mapping[str, pd.DataFrame]) -> Figure:
     """Performance profiles: the share of runs that score more than each threshold."""
-    figure, axes = _axes("normalised score", "share of runs above")
+    figure, axes = _axes("normalised score", "share of runs above", (8.0, 3.6))
     top = max(100.0, *(float(scores.to_numpy().max()) for scores in groups.values()))
     thresholds = np.linspace(0.0, top, 201)
     for index, (name, scores) in enumerate(list(groups.items())[:MOST]):
-        style = "-" if index < COLOURS else "--"
-        axes.plot(thresholds, performance_profile(scores, thresholds), style, label=name, drawstyle="steps-post")
-    axes.legend(frameon=False, fontsize=7)
+        values = performance_profile(scores, thresholds)
+        axes.plot(thresholds, values, _style(index), label=name, drawstyle="steps-post")
+    figure.legend(loc="outside right upper", frameon=False, fontsize=7)
     return figure
 
 
 def plot_budgets(curves: Mapping[str, NDArray[np.float64]]) -> Figure:
     """Score of the setting that a bandit finds with so many evaluation episodes."""
-    figure, axes = _axes("evaluation episodes spent", "score of the setting chosen")
-    for name, curve in curves.items():
-        axes.plot(np.arange(1, len(curve) + 1), curve, label=name)
-    axes.legend(frameon=False, fontsize=8)
+    figure, axes = _axes("evaluation episodes spent", "score of the setting chosen", (8.0, 3.6))
+    for index, (name, curve) in enumerate(curves.items()):
+        axes.plot(np.arange(1, len(curve) + 1), curve, _style(index), label=name)
+    figure.legend(loc="outside right upper", frameon=False, fontsize=7)
     return figure

@@ -26,8 +26,6 @@ KNOWN = "known.json"
 """What was found elsewhere, in a study's folder."""
 PULLS = 100
 """Evaluation episodes that the curve of `evaluation_curve` goes up to."""
-
-
 REMEDY = "run the study again"
 
 
@@ -41,8 +39,12 @@ def remember(place: Path, known: Iterable[Path]) -> None:
     Raises:
         UserError: No study is there, a file is damaged, or a report has no cell of this study.
     """
-    _, jobs = _cells(place)
-    found_elsewhere(place / KNOWN, known, {key for keys in jobs.values() for key in keys}).save(place / KNOWN)
+    _elsewhere(place, _cells(place)[1], known).save(place / KNOWN)
+
+
+def _elsewhere(place: Path, cells: Mapping[str, Iterable[str]], known: Iterable[Path] = ()) -> Found:
+    """What was found elsewhere of the jobs that the cells are made of: told before, and in reports given now."""
+    return found_elsewhere(place / KNOWN, known, {key for keys in cells.values() for key in keys})
 
 
 def _cells(place: Path) -> tuple[Mapping[str, Any], dict[str, list[str]]]:
@@ -83,10 +85,9 @@ class Results:
         Raises:
             UserError: No study is there, or a file is damaged.
         """
-        record, jobs = _cells(place)
+        record, cells = _cells(place)
         with parsing(place / CELLS, REMEDY):
-            found = found_elsewhere(place / KNOWN, (), {key for keys in jobs.values() for key in keys})
-            found |= Found.of_nodes(place.parent / NODES, jobs)
+            found = _elsewhere(place, cells) | Found.of_nodes(place.parent / NODES, cells)
             table = pd.DataFrame([_row(cell, found) for cell in record["cells"]])
             return cls(place, dict(record["study"]), record["command"], table, found)
 
