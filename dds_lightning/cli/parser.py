@@ -117,8 +117,8 @@ def _help(documentation: str, parameter: str) -> str:
 def prepare(arguments: list[str]) -> list[str]:
     """Expand the shorthands that jsonargparse does not know; one value of a list is a list of one.
 
-    A bare `--fresh` means `--fresh=true`, and for `dds run` an option like `--skill.trainer.max_steps=100`
-    (or the same as two arguments) is collected for the `fit` command of that stage.
+    A bare `--fresh` means `--fresh=true`, and takes true or false as its value if that follows. For `dds run` an
+    option like `--skill.trainer.max_steps=100` (or the same as two arguments) is collected for that stage's `fit`.
 
     Raises:
         UserError: Such an option has no value.
@@ -135,7 +135,7 @@ def prepare(arguments: list[str]) -> list[str]:
     if callable(entry):
         arguments = as_lists(arguments, list_options(entry))
     out: list[str] = []
-    rest = iter(arguments)
+    rest, before = iter(arguments), ""
     for argument in rest:
         stage, _, option = argument.removeprefix("--").partition(".")
         if arguments[0] == "run" and argument.startswith("--") and stage in run_stages() and option:
@@ -145,8 +145,11 @@ def prepare(arguments: list[str]) -> list[str]:
                     raise UserError(f"{argument} has no value: write {argument}=VALUE")
                 option = f"{option}={value}"
             out.append(f"--{stage}+=--{option}")
+        elif before in flags and argument in ("true", "false"):
+            out[-1] = f"{before}={argument}"
         else:
             out.append(f"{argument}=true" if argument in flags else argument)
+        before = argument
     return out
 
 

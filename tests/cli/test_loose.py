@@ -109,6 +109,19 @@ def test_one_value_is_a_list_of_one(words, expected):
 
 
 @pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("run t --fresh --seed 1", "run t --fresh=true --seed 1"),
+        ("run t --fresh true --seed 1", "run t --fresh=true --seed 1"),
+        ("study run f --plan false", "study run f --plan=false"),
+        ("study run --plan f", "study run --plan=true f"),
+    ],
+)
+def test_a_flag_may_be_bare_or_say_true_or_false(words, expected):
+    assert prepare(words.split()) == expected.split()
+
+
+@pytest.mark.parametrize(
     ("held", "asked", "other"),
     [
         ("hopper-medium", "walker2d-medium", True),
