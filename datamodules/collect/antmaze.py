@@ -2,8 +2,8 @@
 
 Episodes of 1,000 steps: the ant walks to a goal, and once there to a new one. `diverse` tasks start and head anywhere,
 `play` tasks start anywhere and head for hand-picked cells, `antmaze-umaze` always goes from the start to the goal.
-Rewards are those of the evaluation goal, drawn anew for every episode as the evaluation draws it: 1 where a step leads
-to within 0.5 m of it.
+Rewards are those of the evaluation goal: 1 where a step leads to within `Task.goal_radius` of it. In D4RL's physics it
+is drawn anew for every episode, as the evaluation draws it; in gymnasium-robotics' it stands still.
 """
 
 from __future__ import annotations
@@ -86,7 +86,8 @@ class _Recorder:
 
     def env(self, body: int = 0) -> gym.Env[Any, Any]:
         while len(self._envs) <= body:
-            self._envs.append(build_env(self.task.env_id, max_episode_steps=self.recipe.episode_steps))
+            ends = {"continuing_task": True} if self.task.adapter == "maze" else {}
+            self._envs.append(build_env(self.task.env_id, max_episode_steps=self.recipe.episode_steps, **ends))
         return self._envs[body]
 
     def __call__(self, number: int) -> list[Episode]:
@@ -95,7 +96,8 @@ class _Recorder:
         walks = []
         for body in range(min(BODIES, -(-left // each))):
             rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number, body)))
-            walks.append(_Walk(self.task, self.recipe, self.env(body).unwrapped, rng, min(each, left - body * each)))
+            ant = _Ant(self.task, self.env(body).unwrapped)
+            walks.append(_Walk(self.task, self.recipe, ant, rng, min(each, left - body * each)))
         while walking := [walk for walk in walks if walk.left]:
             states = np.stack([walk.state for walk in walking])
             headings = np.array([walk.heading() for walk in walking])
@@ -104,11 +106,52 @@ class _Recorder:
         return [episode for walk in walks for episode in walk.episodes]
 
 
+class _Ant:
+    """The body in a maze of either physics: D4RL's environment is its simulator, gymnasium-robotics' has one inside."""
+
+    def __init__(self, task: Task, env: Any) -> None:
+        self.task, self.env = task, env
+        self.simulator = getattr(env, "ant_env", env)
+
+    def reset(self, seed: int) -> NDArray[np.float64]:
+        """Stand at the task's start; return the goal by which an evaluation would reward, (2,)."""
+        if self.simulator is self.env:
+            self.env.reset(seed=seed)
+            return np.array(self.env.goal)
+        cells = {"reset_cell": self.task.start_cell, "goal_cell": self.task.goal_cell}
+        self.env.reset(seed=seed, options={name: np.asarray(cell) for name, cell in cells.items()})
+        return self.task.goal_xy()
+
+    def move_to(self, cell: Cell) -> NDArray[np.float64]:
+        """Move from the start cell to another, keeping the noise of the reset; return the state."""
+        data = self.simulator.data
+        qpos = data.qpos.copy()
+        qpos[:2] += self.task.cell_to_xy(cell) - self.task.start_xy()
+        self.simulator.set_state(qpos, data.qvel.copy())
+        return self.state()
+
+    def step(self, action: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Act; return the state."""
+        self.simulator.step(action)
+        return self.state()
+
+    def state(self) -> NDArray[np.float64]:
+        """What the task observes, (29,)."""
+        data = self.simulator.data
+        return np.concatenate([data.qpos[:15], data.qvel[:14]])
+
+    def observed(self, states: NDArray[np.float64], goals: NDArray[np.float64]) -> Any:
+        """States (T + 1, 29) with the rewarded goals (T + 1, 2) as the environment's own observations."""
+        if self.simulator is self.env:
+            return states
+        return {"observation": states[:, 2:], "achieved_goal": states[:, :2], "desired_goal": goals}
+
+
 class _Walk:
     """One body that walks a number of steps, in one episode, or in more where some end early."""
 
-    def __init__(self, task: Task, recipe: AntMazeRecipe, env: Any, rng: np.random.Generator, steps: int) -> None:
-        self.task, self.recipe, self.env, self.rng, self.left = task, recipe, env, rng, steps
+    def __init__(self, task: Task, recipe: AntMazeRecipe, ant: _Ant, rng: np.random.Generator, steps: int) -> None:
+        self.task, self.recipe, self.ant, self.rng, self.left = task, recipe, ant, rng, steps
         self.waypoints = Waypoints(task)
         # With a single goal there is no next one: the episode ends there, as in D4RL's `antmaze-umaze`.
         self.ends_at_goal = len(task.data_goal_cells or ()) == 1
@@ -117,10 +160,9 @@ class _Walk:
 
     def _begin(self) -> None:
         """Start an episode that may take all of the remaining steps."""
-        task, recipe, env, length = self.task, self.recipe, self.env, self.left
-        env.reset(seed=int(self.rng.integers(2**31)))
-        self.evaluation_goal = env.goal.copy()
-        self.state = self._placed(_draw(self.rng, task.data_start_cells or task.free_cells()))
+        task, recipe, length = self.task, self.recipe, self.left
+        self.evaluation_goal = self.ant.reset(int(self.rng.integers(2**31)))
+        self.state = self.ant.move_to(_draw(self.rng, task.data_start_cells or task.free_cells()))
         self.noise = recipe.action_noise * self.rng.standard_normal((length, task.action_dim))
         self.offsets = (self.rng.uniform(0.0, 1.0, (length, 2)) * recipe.waypoint_noise).tolist()
         self.observations = np.empty((length + 1, task.observation_dim))
@@ -141,7 +183,7 @@ class _Walk:
     def step(self, action: NDArray[np.float64]) -> None:
         """Act once, with noise; begin the next episode where this one ends."""
         self.actions[self.t] = np.clip(action + self.noise[self.t], -1.0, 1.0)
-        self.state = self.env.step(self.actions[self.t])[0]
+        self.state = self.ant.step(self.actions[self.t])
         self.t, self.left = self.t + 1, self.left - 1
         there = math.hypot(self.state[0] - self.goal[0], self.state[1] - self.goal[1]) <= self.task.goal_radius
         if there and not self.ends_at_goal:
@@ -160,28 +202,21 @@ class _Walk:
         length = self.t
         observations = self.observations[: length + 1].copy()
         near = np.linalg.norm(observations[1:, :2] - self.evaluation_goal, axis=1) <= self.task.goal_radius
+        rewarded = np.tile(self.evaluation_goal, (length + 1, 1))
         return {
-            "observations": observations,
+            "observations": self.ant.observed(observations, rewarded),
             "actions": self.actions[:length].copy(),
             "rewards": near.astype(np.float32),
             "terminations": np.zeros(length, bool),
             "truncations": np.arange(length) == length - 1,
             "infos": {
                 "goal": self.goals[: length + 1].copy(),
-                "evaluation_goal": np.tile(self.evaluation_goal, (length + 1, 1)),
+                "evaluation_goal": rewarded,
             },
         }
 
-    def _placed(self, cell: Cell) -> NDArray[np.float64]:
-        """Move the body from the start cell to another, keeping the noise of the reset."""
-        data = self.env.data
-        qpos = data.qpos.copy()
-        qpos[:2] += self.task.cell_to_xy(cell)  # the start cell is the origin
-        self.env.set_state(qpos, data.qvel.copy())
-        return np.concatenate([data.qpos[:15], data.qvel[:14]])
-
     def _new_goal(self) -> tuple[float, float]:
-        """A goal in a cell other than the body's, with the evaluation's noise."""
+        """A goal in a cell other than the body's, with the environment's noise."""
         here = tuple(self.task.xy_to_cell(self.state[:2]).tolist())
         cells = self.task.data_goal_cells or self.task.free_cells()
         elsewhere = [cell for cell in cells if self.ends_at_goal or cell != here]
@@ -189,8 +224,11 @@ class _Walk:
 
 
 def _goal_near(task: Task, cell: Cell, rng: np.random.Generator) -> tuple[float, float]:
-    """A goal in a cell, where the evaluation would draw it."""
-    x, y = (task.cell_to_xy(cell) + rng.uniform(0.0, 1.0, 2) + rng.uniform(0.0, 0.5, 2)).tolist()
+    """A goal in a cell, where the environment would draw it."""
+    quarter = 0.25 * task.cell_size
+    d4rl = task.physics == "d4rl"
+    noise = rng.uniform(0.0, 1.0, 2) + rng.uniform(0.0, 0.5, 2) if d4rl else rng.uniform(-quarter, quarter, 2)
+    x, y = (task.cell_to_xy(cell) + noise).tolist()
     return x, y
 
 
@@ -200,10 +238,10 @@ def _draw(rng: np.random.Generator, cells: Any) -> Cell:
 
 def _description(task: Task, seed: int, recipe: AntMazeRecipe) -> str:
     return (
-        f"An ant walks through {task.env_id} with D4RL's physics; a new goal follows each one reached. A planner over "
+        f"An ant walks through {task.env_id}; a new goal follows each one reached. A planner over "
         f"the maze's cells gives waypoints (up to {recipe.waypoint_noise} m beyond a cell's centre), a trained "
         f"controller walks towards them with action noise {recipe.action_noise}. Rewards are those of the evaluation "
-        f"goal, drawn once an episode. Seed {seed}."
+        f"goal{', drawn once an episode' if task.goal_noise else ''}. Seed {seed}."
     )
 
 
@@ -214,7 +252,7 @@ class AntNavigator:
         """Prepare for `task`; without a recipe the controller is at its best, without noise on actions."""
         self.task = get_task(task)
         self.recipe = recipe or AntMazeRecipe(action_noise=0.0)
-        self.controller = AntController("d4rl")
+        self.controller = AntController(self.task.physics)
         self.reset()
 
     def reset(self, num_envs: int = 1, seed: int | None = None) -> None:
@@ -226,8 +264,11 @@ class AntNavigator:
         self._goals = [self._goal(rng) for rng in self._goal_rngs]
 
     def _goal(self, rng: np.random.Generator) -> tuple[float, float]:
-        """A position among the evaluation's goals, which an actor does not observe."""
+        """A position among the evaluation's goals, of which an actor does not observe which one it is."""
         assert self.task.goal_cell is not None
+        if not self.task.goal_noise:
+            x, y = self.task.goal_xy().tolist()
+            return x, y
         return _goal_near(self.task, self.task.goal_cell, rng)
 
     def act(
@@ -263,5 +304,5 @@ class AntNavigator:
         return np.clip(actions + noise, -1.0, 1.0).astype(np.float32)
 
 
-COLLECTOR = Collector("antmaze", "d4rl", 1_000_000, AntMazeRecipe, _plan, AntNavigator)
+COLLECTOR = Collector("antmaze", ("d4rl", "robotics"), 1_000_000, AntMazeRecipe, _plan, AntNavigator)
 collect_antmaze = COLLECTOR.collect

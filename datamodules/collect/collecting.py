@@ -53,7 +53,7 @@ class Collector:
 
     Attributes:
         family: Of the tasks that it serves.
-        physics: Of the tasks that it serves; None serves all.
+        physics: Those of the tasks that it serves; None serves all.
         steps: Environment steps of a set unless another number is given.
         recipe: Dataclass of what the behaviour does; every field has a default.
         plan: What to record for (task, seed, steps, recipe).
@@ -61,7 +61,7 @@ class Collector:
     """
 
     family: str
-    physics: str | None
+    physics: tuple[str, ...] | None
     steps: int
     recipe: type[Any]
     plan: Callable[[Task, int, int, Any], DataSetPlan]
@@ -104,8 +104,8 @@ class Collector:
             UserError: For a task that this collector does not serve, a number out of range, or a folder that exists.
         """
         task = get_task(task)
-        if task.family != self.family or self.physics not in (None, task.physics):
-            physics = f" in {self.physics} physics" if self.physics else ""
+        if task.family != self.family or (self.physics and task.physics not in self.physics):
+            physics = f" in {' or '.join(self.physics)} physics" if self.physics else ""
             raise UserError(f"task: '{task.name}' cannot be collected here, expected a task of {self.family}{physics}")
         recipe = replace(recipe or self.recipe(), **settings)
         steps = self.steps if steps is None else steps

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 COLLECTORS = {
     ("pointmaze", ""): "datamodules.collect.pointmaze",
     ("antmaze", "d4rl"): "datamodules.collect.antmaze",
+    ("antmaze", "robotics"): "datamodules.collect.antmaze",
     ("locomotion", "v4"): "datamodules.collect.locomotion",
     ("kitchen", ""): "datamodules.collect.kitchen",
 }

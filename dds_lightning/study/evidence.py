@@ -1,7 +1,7 @@
 """What a run's stages are worth one by one: the numbers from which `verdict` names the weak one.
 
 ```
- data ──► how many episodes end early and no termination says why
+ data ──► how many episodes end early and no termination says why; in a maze, whether there is time to arrive
  skills ─► codes in use, fidelity in the simulator, how much held-out loss was still falling
  critic ─► rank correlation of V with the returns of held-out episodes
  policy ─► how far it has moved from the policy of the data, and whether it learnt that one by heart
@@ -34,12 +34,44 @@ STATES = 5000
 
 
 def data_evidence(trajectories: Trajectories, task: Task) -> dict[str, Any]:
-    """Return shares of episodes: `ends_early`, before the task's limit, and `terminates`, by a termination."""
+    """Return what the data say of themselves.
+
+    Returns:
+        Shares of episodes: `ends_early`, before the task's limit, and `terminates`, by a termination. In a maze also
+        `way_share`: the steps from start to goal at the data's pace, as a share of those that an episode may have.
+    """
     ended = trajectories.terminations[trajectories.step_offsets[1:] - 1]
-    return {
+    found = {
         "ends_early": float((trajectories.lengths < EARLY * task.max_episode_steps).mean()),
         "terminates": float(ended.mean()),
     }
+    if task.maze_map is not None and task.start_cell and task.goal_cell:
+        found["way_share"] = steps_to_goal(trajectories, task) / task.max_episode_steps
+    return found
+
+
+def steps_to_goal(trajectories: Trajectories, task: Task) -> float:
+    """How many steps the shortest way over a maze's cells takes at the data's pace.
+
+    The pace is the median distance between two places half a cell apart along the data's ways, divided by the steps in
+    between, so that swaying on the spot is no progress.
+    """
+    from datamodules.collect.planner import planner_for
+
+    assert task.maze_map is not None
+    assert task.start_cell is not None
+    assert task.goal_cell is not None
+    way = task.cell_size * (len(planner_for(task.maze_map).path(task.start_cell, task.goal_cell)) - 1)
+    places = np.asarray(trajectories.observations[:, :2], np.float64)
+    first = np.ones(len(places), bool)
+    first[trajectories.observation_offsets[1:] - 1] = False  # the last place of an episode
+    walked = np.linalg.norm(np.diff(places, axis=0), axis=1)[first[:-1]].mean()
+    apart = int(np.clip(np.ceil(0.5 * task.cell_size / max(walked, 1e-9)), 1, trajectories.lengths.max()))
+    starts = np.arange(len(places) - apart)
+    episodes = np.searchsorted(trajectories.observation_offsets[1:], [starts, starts + apart], side="right")
+    starts = starts[episodes[0] == episodes[1]]
+    pace = float(np.median(np.linalg.norm(places[starts + apart] - places[starts], axis=1))) / apart
+    return way / max(pace, 1e-9)
 
 
 def skill_evidence(skill: SkillModule, checkpoint: Path) -> dict[str, Any]:

@@ -4,6 +4,7 @@
  reaches what its data hold? ── yes ──► nothing to mend
    │ no
    ├─ episodes end early, no termination says why ──► data
+   ├─ a maze, and too slow to cross it in time ─────► data
    ├─ fewer than half of the codes in use ──────────► skills
    ├─ beta is worse than the codes' plain shares ───► policy
    ├─ V does not rank held-out returns ─────────────► critic
@@ -31,6 +32,9 @@ OF_THE_BEST = 0.9
 """Share of the best episode's score with which a run is well served."""
 MISSING = 0.2
 """Share of episodes that end early, and none by a termination, from which terminations are thought to be missing."""
+SLOW = 0.9
+"""Share of an episode that the way to a maze's goal takes at the data's pace, from which an agent hardly arrives;
+it was 0.2 to 0.6 in good runs."""
 
 
 class Verdict(NamedTuple):
@@ -72,6 +76,13 @@ def verdict(scores: Mapping[str, float], evidence: Mapping[str, float]) -> Verdi
             f"Data: {100 * evidence['ends_early']:.0f} % of the episodes end early, but none by a termination. If they "
             "ended because the robot fell or succeeded, record that as `terminations`: the critic cannot see it "
             "otherwise.",
+        )
+    if ask("way_share", 0.0) > SLOW:
+        return Verdict(
+            "data",
+            f"Data: too slow to arrive. At their pace the shortest way from start to goal takes "
+            f"{100 * evidence['way_share']:.0f} % of the steps that an episode may have. Record faster movements, or "
+            "take a nearer goal (TASK?goal=ROW,COLUMN).",
         )
     if 2 * ask("codes_used", math.inf) < ask("num_skills", 0.0):
         return Verdict(

@@ -136,6 +136,7 @@ def _antmaze(size: str, *, file: str, goals: tuple[Cell, ...], scores: Any) -> t
                 "goal_noise": 0.0,
                 "data_env_ids": robotics,
                 "data_reward": "goal",
+                "data_ids": {**task.data_ids, "local": f"{name}-robotics-v0"},  # both can be collected
             },
         )
 

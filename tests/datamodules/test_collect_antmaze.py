@@ -15,6 +15,7 @@ import pytest
 from datamodules import load_trajectories
 from datamodules.collect import antmaze, recording
 from datamodules.collect.antmaze import AntMazeRecipe, AntNavigator, collect_antmaze
+from datamodules.physics.check import replay_check
 from dds_lightning.errors import UserError
 from dds_lightning.rollout.actors import Contestant
 from dds_lightning.rollout.play import rollout
@@ -144,18 +145,35 @@ def test_a_flipped_ant_lies_there_unless_told_otherwise() -> None:
     for ends in (False, True):
         recipe = AntMazeRecipe(episode_steps=80, end_when_flipped=ends)
         recorder = antmaze._Recorder(task, 0, 80, recipe)
-        walk = antmaze._Walk(task, recipe, recorder.env().unwrapped, np.random.default_rng(0), 80)
-        qpos = walk.env.data.qpos.copy()
+        ant = antmaze._Ant(task, recorder.env().unwrapped)
+        walk = antmaze._Walk(task, recipe, ant, np.random.default_rng(0), 80)
+        qpos = ant.simulator.data.qpos.copy()
         qpos[2:7] = 0.3, 0.0, 1.0, 0.0, 0.0  # on its back
-        walk.env.set_state(qpos, 0 * walk.env.data.qvel)
+        ant.simulator.set_state(qpos, 0 * ant.simulator.data.qvel)
         while walk.left:
             walk.step(np.zeros(8))
         assert len(walk.episodes) > 1 if ends else len(walk.episodes) == 1
         assert sum(len(episode["rewards"]) for episode in walk.episodes) == 80
 
 
-def test_the_navigator_reaches_the_goal() -> None:
-    task = dataclasses.replace(get_task("antmaze-umaze"), max_episode_steps=400)
+def test_in_robotics_physics_the_set_is_one_of_that_environment(tmp_path: Path) -> None:
+    name = "antmaze-umaze-diverse@robotics"
+    folder, task = collect(tmp_path, 200, task=name), get_task(name)
+    found = arrays(folder)
+    observations = found["episode_0/observations/observation"]
+    assert observations.shape == (61, 27)
+    np.testing.assert_array_equal(found["episode_0/observations/desired_goal"], np.tile(task.goal_xy(), (61, 1)))
+    data = load_trajectories(f"local:{folder}", name)
+    np.testing.assert_array_equal(data.observations[:61, 2:], observations.astype(np.float32))
+    assert {tuple(cell) for cell in task.xy_to_cell(data.observations[[0, 61, 122]][:, :2]).tolist()} <= set(
+        task.free_cells()
+    )
+    assert replay_check(f"local:{folder}", name, steps=20).fit
+
+
+@pytest.mark.parametrize("physics", ["d4rl", "robotics"])
+def test_the_navigator_reaches_the_goal(physics: str) -> None:
+    task = dataclasses.replace(get_task(f"antmaze-umaze@{physics}"), max_episode_steps=400)
     result = rollout(task, [Contestant("navigator", AntNavigator(task), 4)], workers=0, progress=False)
     assert result.episodes["success"].sum() >= 3  # now and then an ant falls over
 
@@ -163,8 +181,7 @@ def test_the_navigator_reaches_the_goal() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"task": "pointmaze-umaze-play"}, "cannot be collected here, expected a task of antmaze in d4rl physics"),
-        ({"task": "antmaze-umaze@robotics"}, "cannot be collected here, expected a task of antmaze in d4rl physics"),
+        ({"task": "pointmaze-umaze-play"}, "cannot be collected here, expected a task of antmaze in d4rl or robotics"),
         ({"steps": 0}, "steps: got 0"),
         ({"seed": -1}, "seed is -1, expected a whole number"),
         ({"workers": 0}, "workers: got 0"),

@@ -14,6 +14,7 @@ from datamodules.behaviours.training.evaluation import RunnerScore
 from datamodules.behaviours.training.publish import MAZES, NOISES, Rung, ant_card, publish_mazes, runner_card
 from datamodules.behaviours.training.recipes import get_recipe
 from dds_lightning.envs.antmaze import D4RLAntMazeEnv
+from dds_lightning.envs.build import build_env
 from dds_lightning.errors import UserError
 
 
@@ -40,12 +41,13 @@ def test_ladders_rise_from_random_to_expert(behaviour):
     assert any(0.3 * scores[-1] < score < 0.55 * scores[-1] for score in scores)  # a medium
 
 
-def test_the_shipped_ant_walks_where_it_is_told():
-    ant = D4RLAntMazeEnv(("0",), (0, 0), (0, 0))
-    controller = AntController("d4rl")
+@pytest.mark.parametrize(("physics", "steps"), [("d4rl", 60), ("robotics", 120)])
+def test_the_shipped_ant_walks_where_it_is_told(physics, steps):
+    ant = D4RLAntMazeEnv(("0",), (0, 0), (0, 0)) if physics == "d4rl" else build_env("Ant-v4").unwrapped
+    controller = AntController(physics)
     for heading in np.linspace(-np.pi, np.pi, 5)[:-1] + 0.4:
         ant.reset(seed=1, options={"noise": False})
-        for _ in range(60):
+        for _ in range(steps):
             observation = np.concatenate([ant.data.qpos, ant.data.qvel])
             action = controller.act(observation[None], [heading])[0]
             ant.step(action)
@@ -67,15 +69,16 @@ def test_paths_are_the_repositorys():
     assert Path(__file__).resolve().parents[2] / "checkpoints" / "behaviours" == SHIPPED
 
 
-def test_the_shipped_ant_walks_to_the_goals_of_mazes_and_its_card_tells(tmp_path):
+@pytest.mark.parametrize("physics", ["d4rl", "robotics"])
+def test_the_shipped_ant_walks_to_the_goals_of_mazes_and_its_card_tells(physics, tmp_path):
     shutil.copytree(SHIPPED / "ant", tmp_path / "ant")
-    folder = publish_mazes(1, tmp_path)
-    walks = pd.read_csv(folder / MAZES)
+    folder = publish_mazes(physics, 1, tmp_path)
+    walks = pd.read_csv(folder / MAZES.format(physics))
     assert walks["maze"].tolist() == [maze for maze in ("umaze", "medium", "large") for _ in NOISES]
     assert walks["cap"].tolist() == [700] * 3 + [1000] * 6
     assert walks["reached"].sum() >= 7, walks
     median = walks.loc[0, "median_steps"]
     assert f"| umaze | 0 | 100 % | {median:.0f} | 700 |" in (folder / "README.md").read_text()
-    assert MAZES in (folder / "SHA256SUMS").read_text()
+    assert MAZES.format(physics) in (folder / "SHA256SUMS").read_text()
     with pytest.raises(UserError, match="holds no controller"):
-        publish_mazes(1, tmp_path / "elsewhere")
+        publish_mazes(physics, 1, tmp_path / "elsewhere")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from datamodules.collect.planner import planner_for
 from datamodules.relabelled import RelabeledDataModule
 from datamodules.trajectories import Trajectories
 from dds_lightning.policy import PolicyModule
@@ -40,6 +41,25 @@ def test_episodes_that_end_early_and_those_that_say_why():
         "ends_early": 0.75,
         "terminates": 0.25,
     }
+
+
+def test_the_way_through_a_maze_at_the_pace_of_the_data():
+    """Two walks at 0.1 m a step, one of them swaying across its way: 12 cells of 1 m, in 120 of 800 steps."""
+    task = get_task("pointmaze-large-diverse")
+    along = np.arange(201, dtype=np.float32) * 0.1
+    episodes = [
+        {
+            "observations": np.stack([along, sway * (-1.0) ** np.arange(201), 0 * along, 0 * along], axis=1),
+            "actions": np.zeros((200, 2), np.float32),
+            "rewards": np.zeros(200),
+            "terminations": np.zeros(200, bool),
+            "truncations": np.arange(200) == 199,
+        }
+        for sway in (0.0, 0.02)
+    ]
+    cells = len(planner_for(task.maze_map).path(task.start_cell, task.goal_cell)) - 1
+    found = data_evidence(Trajectories.from_episodes("walks", episodes), task)
+    assert found["way_share"] == pytest.approx(cells / 0.1 / task.max_episode_steps, rel=0.02)
 
 
 def test_the_critic_is_ranked_by_returns_to_go(tmp_path):

@@ -26,6 +26,7 @@ EVIDENCE = {
     ("spoilt", "stage", "text"),
     [
         ({"terminates": 0.0}, "data", "Data: 50 % of the episodes end early, but none by a termination"),
+        ({"way_share": 1.02}, "data", "Data: too slow to arrive. .* takes 102 % of the steps"),
         ({"codes_used": 4}, "skill", "Skills: only 4 of 16 codes are in use"),
         (
             {"beta_loss": 8.8, "critic_rank": 0.05},

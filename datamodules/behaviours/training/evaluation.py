@@ -165,10 +165,11 @@ def score_walker(
     )
 
 
-def score_navigator(noises: tuple[float, ...], *, episodes: int = 100, seed: int = 0) -> pd.DataFrame:
-    """Let the shipped Ant controller walk from the start to the evaluation's goal, in each of D4RL's mazes.
+def score_navigator(physics: str, noises: tuple[float, ...], *, episodes: int = 100, seed: int = 0) -> pd.DataFrame:
+    """Let a shipped Ant controller walk from the start to the evaluation's goal, in each of D4RL's mazes.
 
     Args:
+        physics: "d4rl" or "robotics".
         noises: Standard deviations of Gaussian noise on the actions.
         episodes: Number of episodes for each maze and noise.
         seed: Seed of goals, starts and noise.
@@ -183,7 +184,7 @@ def score_navigator(noises: tuple[float, ...], *, episodes: int = 100, seed: int
 
     rows = []
     for maze in ("umaze", "medium", "large"):
-        task = get_task("antmaze-umaze" if maze == "umaze" else f"antmaze-{maze}-diverse")
+        task = get_task(f"antmaze-{maze}{'' if maze == 'umaze' else '-diverse'}").variant(physics)
         players = [
             Contestant(f"{noise:g}", AntNavigator(task, AntMazeRecipe(action_noise=noise)), episodes)
             for noise in noises

@@ -2,7 +2,7 @@
 
 Scores the snapshots, keeps a ladder from random to expert (for the Ant: the last policy), and writes the card, the
 curve and SHA256SUMS. `publish ant --mazes 100` instead lets the shipped Ant walk to the goals of D4RL's mazes, 100
-episodes each, and adds the table to its card.
+episodes each, and adds the table to its card; `ant-robotics` likewise.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from dds_lightning.tasks import get_task
 
 NOISES = (0.0, 0.1, 0.2)
 """Standard deviations of action noise at which the Ant is scored."""
-MAZES = "mazes-d4rl.csv"
-"""File beside the Ant's policies with its results in mazes."""
+MAZES = "mazes-{}.csv"
+"""Files beside the Ant's policies with their results in mazes, by physics."""
 
 
 @dataclass(frozen=True)
@@ -153,16 +153,18 @@ def draw_curve(curve: pd.DataFrame, column: str, label: str, path: Path) -> None
 
 
 def ant_card(folder: Path) -> str:
-    """The card of the Ant's controllers, from the metadata in their files and the table of mazes, if there is one."""
+    """The card of the Ant's controllers, from the metadata in their files and the tables of mazes that there are."""
     policies = {path.stem: MLPPolicy.load(path).metadata for path in sorted(folder.glob("*.safetensors"))}
-    walks = pd.read_csv(folder / MAZES) if (folder / MAZES).is_file() else None
+    tables = {physics: folder / MAZES.format(physics) for physics in policies}
+    walks = {physics: pd.read_csv(table) for physics, table in tables.items() if table.is_file()}
     return render("datamodules.behaviours.training", "ant_card.md.jinja", {"policies": policies, "walks": walks})
 
 
-def publish_mazes(episodes: int, out: Path) -> Path:
-    """Let the shipped Ant controller walk through D4RL's mazes and add the table to its card.
+def publish_mazes(physics: str, episodes: int, out: Path) -> Path:
+    """Let a shipped Ant controller walk through D4RL's mazes and add the table to its card.
 
     Args:
+        physics: "d4rl" or "robotics".
         episodes: Number of episodes for each maze and noise.
         out: The parent of the folder `ant`.
 
@@ -170,13 +172,13 @@ def publish_mazes(episodes: int, out: Path) -> Path:
         The folder.
 
     Raises:
-        UserError: The folder has no controller for D4RL's physics.
+        UserError: The folder has no controller for this physics.
     """
     folder = out / "ant"
-    if not (folder / "d4rl.safetensors").is_file():
-        raise UserError(f"out: {folder} holds no controller for D4RL's physics; publish one first, without --mazes")
-    walks = score_navigator(NOISES, episodes=episodes)
-    with written_whole(folder / MAZES) as part:
+    if not (folder / f"{physics}.safetensors").is_file():
+        raise UserError(f"out: {folder} holds no controller for {physics} physics; publish one first, without --mazes")
+    walks = score_navigator(physics, NOISES, episodes=episodes)
+    with written_whole(folder / MAZES.format(physics)) as part:
         walks.to_csv(part, index=False)
     return write_card(folder, ant_card(folder))
 
@@ -200,12 +202,13 @@ def main() -> None:
     parser.add_argument("--note", default="", help="a further sentence for the card")
     parser.add_argument("--mazes", type=int, metavar="EPISODES", help="only play the shipped Ant in D4RL's mazes")
     arguments = parser.parse_args()
-    if arguments.mazes is not None and (arguments.mazes < 1 or arguments.behaviour != "ant"):
-        parser.error("--mazes is for the ant, and takes a number of episodes of at least 1")
     recipe = get_recipe(arguments.behaviour)
+    body, _, physics = recipe.world.partition(":")
+    if arguments.mazes is not None and (arguments.mazes < 1 or body != "ant"):
+        parser.error("--mazes is for the ant, and takes a number of episodes of at least 1")
     try:
         if arguments.mazes is not None:
-            print(publish_mazes(arguments.mazes, arguments.out))
+            print(publish_mazes(physics, arguments.mazes, arguments.out))
             return
         print(publish(recipe, arguments.run or Path("runs/behaviours") / recipe.name, arguments.out, arguments.note))
     except UserError as error:
