@@ -26,11 +26,12 @@ Array = NDArray[np.float64]
 class WalkRules:
     """What is rewarded and what disturbs; steps are the environment's.
 
-    The reward of a step is `speed along the heading - sideways * |speed across it| + alive - effort * |action|^2
-    - level * (1 - cosine of the tilt)`, with speeds in metres per second. The disturbances are there because mazes
-    have walls and collectors add noise.
+    The reward of a step is `min(speed along the heading, cruise) - sideways * |speed across it| + alive
+    - effort * |action|^2 - level * (1 - cosine of the tilt)`, with speeds in metres per second. The disturbances are
+    there because mazes have walls and collectors add noise.
 
     Attributes:
+        cruise: Speed beyond which nothing more is earned: who may only be faster by falling more often is not.
         sideways: Weight of the speed across the heading.
         alive: Reward of every step.
         effort: Weight of the squared action.
@@ -46,6 +47,7 @@ class WalkRules:
         episode_steps: Length of the longest episode.
     """
 
+    cruise: float = np.inf
     sideways: float = 0.3
     alive: float = 0.3
     effort: float = 0.02
@@ -63,7 +65,9 @@ class WalkRules:
 
 RULES = {
     "d4rl": WalkRules(),
-    "robotics": WalkRules(heading_steps=(20, 160), drift=0.02, kick_probability=0.005),
+    "robotics": WalkRules(
+        cruise=2.0, alive=1.5, level=1.0, heading_steps=(20, 160), drift=0.02, kick_probability=0.005
+    ),
 }
 """Rules by physics; a step of "robotics" is half as long."""
 
@@ -204,7 +208,7 @@ class AntWorld(VecEnv):
         effort = np.square(self.actions).sum(axis=1)
         self.upright = rotation_matrices(self.qpos[:, 3:7])[:, 2, 2]
         costs = rules.sideways * across + rules.effort * effort + rules.level * (1.0 - self.upright)
-        rewards = self.speed + rules.alive - costs
+        rewards = np.minimum(self.speed, rules.cruise) + rules.alive - costs
         self.speed_sum += self.speed
         fell = self.upright < rules.fallen
         late = self.steps >= rules.episode_steps
