@@ -324,3 +324,18 @@ def test_a_resting_ant_neither_moves_nor_falls():
     assert abs(score.speed) < 0.2
     assert score.falls_per_1000 == 0
     assert score.steps == 120
+
+
+def test_speed_beyond_the_cruise_earns_nothing():
+    pytest.importorskip("stable_baselines3")
+    from datamodules.behaviours.training.ant_world import AntWorld, calm
+
+    rewards = {}
+    for cruise in (np.inf, 0.05):
+        world = AntWorld("d4rl", 4, replace(calm("d4rl"), cruise=cruise), seed=1)
+        world.reset()
+        world.step_async(np.full((4, 8), 0.5, np.float32))
+        rewards[cruise] = world.step_wait()[1]
+    beyond = np.maximum(world.speed - 0.05, 0.0)
+    assert (beyond > 0).any()
+    np.testing.assert_allclose(rewards[np.inf] - rewards[0.05], beyond, atol=1e-6)
