@@ -121,7 +121,8 @@ def policy_evidence(data: RelabeledDataModule, policy: PolicyModule) -> dict[str
         policy: The trained module.
 
     Returns:
-        `critic_rank`: Spearman's correlation of V with the discounted return to the episode's end; and with
+        `critic_rank`: Spearman's correlation of V with the discounted return to the episode's end, plus V there if only
+        the recording ended, or a long way from a rare reward would count as a short one; and with
         ``awr: closed_form`` `policy_shift`: KL(pi || beta) as a share of the most that any choice among the codes of
         the data gives, 0 for the policy of the data, 1 for always the critic's best code; and, where episodes are held
         out, `beta_loss` and `share_loss`: cross entropy, in nats, of their codes under beta and under the plain shares
@@ -135,8 +136,13 @@ def policy_evidence(data: RelabeledDataModule, policy: PolicyModule) -> dict[str
     index = data.validation_index if len(data.validation_index) else torch.arange(len(data.transitions))
     index = index[:STATES]
     relabelling = data.relabelling.for_task(data.task)
-    rewards = relabelling.learning_rewards(data.trajectories, data.horizon)
-    returns = returns_to_go(rewards, data.trajectories.lengths, relabelling.step_discount(data.horizon))
+    trajectories, discount = data.trajectories, relabelling.step_discount(data.horizon)
+    rewards = relabelling.learning_rewards(trajectories, data.horizon)
+    ends, lasts = trajectories.step_offsets[1:] - 1, trajectories.observation_offsets[1:] - 1  # of each episode
+    goes_on = ~trajectories.terminations[ends]
+    onward = torch.from_numpy(trajectories.observations[lasts[goes_on]])
+    rewards[ends[goes_on]] += discount * policy.v(onward.to(policy.device)).cpu().numpy()
+    returns = returns_to_go(rewards, trajectories.lengths, discount)
     states = data.transitions.observations[index]
     values = policy.v(states.to(policy.device)).cpu().numpy()
     rank = float(spearmanr(values, returns[data.transitions.starts[index].numpy()]).statistic)

@@ -1,6 +1,7 @@
 """Evidence about stages: shares of episodes, ranks of values, and how far a policy has moved."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -62,16 +63,22 @@ def test_the_way_through_a_maze_at_the_pace_of_the_data():
     assert found["way_share"] == pytest.approx(cells / 0.1 / task.max_episode_steps, rel=0.02)
 
 
-def test_the_critic_is_ranked_by_returns_to_go(tmp_path):
+def relabelled(trajectories, tmp_path, gamma) -> RelabeledDataModule:
+    """All of them as transitions under some skills."""
     torch.manual_seed(0)
     skill = SkillModule(2, 1, horizon=3, num_skills=4, **SMALL)
     path = tmp_path / "skill.ckpt"
     torch.save({"state_dict": skill.state_dict(), "hyper_parameters": dict(skill.hparams)}, path)
     data = RelabeledDataModule.from_trajectories(
-        walks([40, 40], [False, False]), str(path), gamma=0.5, discount="per_step", validation_fraction=0.0
+        trajectories, str(path), gamma=gamma, discount="per_step", validation_fraction=0.0
     )
     data.prepare_data()
     data.setup()
+    return data
+
+
+def test_the_critic_is_ranked_by_returns_to_go(tmp_path):
+    data = relabelled(walks([40, 40], [False, False]), tmp_path, gamma=0.5)
     policy = PolicyModule(2, 4, hidden_dims=[8], awr="regression")
     policy.v = lambda observations: observations[:, 0]  # returns to go rise along the way, but for the last steps
     assert policy_evidence(data, policy) == {"critic_rank": pytest.approx(1.0, abs=0.05)}
@@ -79,6 +86,19 @@ def test_the_critic_is_ranked_by_returns_to_go(tmp_path):
     assert policy_evidence(data, policy)["critic_rank"] == pytest.approx(-1.0, abs=0.05)
     policy.v = lambda observations: torch.zeros(len(observations))
     assert policy_evidence(data, policy)["critic_rank"] == 0.0
+
+
+def test_a_recording_that_is_cut_off_does_not_end_what_every_step_costs(tmp_path):
+    """Ten bodies rest at ten places; a step costs 1, and the goal is the farther the lower their place."""
+    places = np.linspace(0.0, 1.0, 10, dtype=np.float32)
+    resting = walks([20] * 10, [False] * 10)
+    observations = np.repeat(np.stack([places, 1 + 0 * places], axis=1), 21, axis=0)
+    data = relabelled(
+        replace(resting, observations=observations, rewards=np.full(200, -1.0, np.float32)), tmp_path, gamma=0.99
+    )
+    policy = PolicyModule(2, 4, hidden_dims=[8], awr="regression")
+    policy.v = lambda observations: -(1 - 0.99 ** (100 * (1 - observations[:, 0]))) / 0.01
+    assert policy_evidence(data, policy)["critic_rank"] > 0.9
 
 
 def test_the_policy_of_the_data_is_asked_about_held_out_skills(tmp_path):
