@@ -75,7 +75,7 @@ def theirs(method: str, task: Task, spec: str, steps: int, seed: int, folder: Pa
     name, settings = PEERS[method]
     config = getattr(d3.algos, name)
     names = [field.name for field in dataclasses.fields(config) if field.name.endswith("encoder_factory")]
-    settings |= dict.fromkeys(names, d3.models.VectorEncoderFactory(WIDTHS))
+    settings = {**settings, **dict.fromkeys(names, d3.models.VectorEncoderFactory(WIDTHS))}
     learner = config(observation_scaler=d3.preprocessing.StandardObservationScaler(), **settings).create("cpu:0")
     silent = d3.logging.NoopAdapterFactory()
     learner.fit(dataset, steps, steps, show_progress=False, logger_adapter=silent)

@@ -24,6 +24,7 @@ from dds_lightning.envs.build import build_env
 from dds_lightning.errors import UserError
 from dds_lightning.saving.files import sha256
 from dds_lightning.tasks import Cell, Task, get_task
+from dds_lightning.tasks.env import ADAPTERS
 
 BODIES = 16
 """Ants that walk side by side in one process; the data depend on it, as on the seed."""
@@ -96,7 +97,7 @@ class _Recorder:
         walks = []
         for body in range(min(BODIES, -(-left // each))):
             rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number, body)))
-            ant = _Ant(self.task, self.env(body).unwrapped)
+            ant = _Ant(self.task, self.env(body))
             walks.append(_Walk(self.task, self.recipe, ant, rng, min(each, left - body * each)))
         while walking := [walk for walk in walks if walk.left]:
             states = np.stack([walk.state for walk in walking])
@@ -109,18 +110,17 @@ class _Recorder:
 class _Ant:
     """The body in a maze of either physics: D4RL's environment is its simulator, gymnasium-robotics' has one inside."""
 
-    def __init__(self, task: Task, env: Any) -> None:
-        self.task, self.env = task, env
-        self.simulator = getattr(env, "ant_env", env)
+    def __init__(self, task: Task, env: gym.Env[Any, Any]) -> None:
+        self.task = task
+        self.env: Any = ADAPTERS[task.adapter](env, task)  # which starts an episode as the evaluation does
+        maze: Any = env.unwrapped
+        self.simulator = getattr(maze, "ant_env", maze)
+        self.nested = self.simulator is not maze
 
     def reset(self, seed: int) -> NDArray[np.float64]:
         """Stand at the task's start; return the goal by which an evaluation would reward, (2,)."""
-        if self.simulator is self.env:
-            self.env.reset(seed=seed)
-            return np.array(self.env.goal)
-        cells = {"reset_cell": self.task.start_cell, "goal_cell": self.task.goal_cell}
-        self.env.reset(seed=seed, options={name: np.asarray(cell) for name, cell in cells.items()})
-        return self.task.goal_xy()
+        self.env.reset(seed=seed)
+        return np.array(self.env.goal)
 
     def move_to(self, cell: Cell) -> NDArray[np.float64]:
         """Move from the start cell to another, keeping the noise of the reset; return the state."""
@@ -142,7 +142,7 @@ class _Ant:
 
     def observed(self, states: NDArray[np.float64], goals: NDArray[np.float64]) -> Any:
         """States (T + 1, 29) with the rewarded goals (T + 1, 2) as the environment's own observations."""
-        if self.simulator is self.env:
+        if not self.nested:
             return states
         return {"observation": states[:, 2:], "achieved_goal": states[:, :2], "desired_goal": goals}
 

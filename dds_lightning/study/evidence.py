@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch.nn.functional import cross_entropy
 
 from dds_lightning.errors import UserError
@@ -63,15 +64,17 @@ def steps_to_goal(trajectories: Trajectories, task: Task) -> float:
     assert task.goal_cell is not None
     way = task.cell_size * (len(planner_for(task.maze_map).path(task.start_cell, task.goal_cell)) - 1)
     places = np.asarray(trajectories.observations[:, :2], np.float64)
-    first = np.ones(len(places), bool)
-    first[trajectories.observation_offsets[1:] - 1] = False  # the last place of an episode
-    walked = np.linalg.norm(np.diff(places, axis=0), axis=1)[first[:-1]].mean()
-    apart = int(np.clip(np.ceil(0.5 * task.cell_size / max(walked, 1e-9)), 1, trajectories.lengths.max()))
-    starts = np.arange(len(places) - apart)
-    episodes = np.searchsorted(trajectories.observation_offsets[1:], [starts, starts + apart], side="right")
-    starts = starts[episodes[0] == episodes[1]]
-    pace = float(np.median(np.linalg.norm(places[starts + apart] - places[starts], axis=1))) / apart
-    return way / max(pace, 1e-9)
+
+    def distances(steps: int) -> NDArray[np.float64]:
+        first = np.arange(trajectories.num_steps - steps + 1)
+        episodes = trajectories.episode_of(first)
+        rows = (first + episodes)[episodes == trajectories.episode_of(first + steps - 1)]
+        found: NDArray[np.float64] = np.linalg.norm(places[rows + steps] - places[rows], axis=1)
+        return found
+
+    apart = np.ceil(0.5 * task.cell_size / max(distances(1).mean(), 1e-9))
+    apart = int(np.clip(apart, 1, trajectories.lengths.max()))
+    return way / max(float(np.median(distances(apart))) / apart, 1e-9)
 
 
 def skill_evidence(skill: SkillModule, checkpoint: Path) -> dict[str, Any]:

@@ -145,7 +145,7 @@ def test_a_flipped_ant_lies_there_unless_told_otherwise() -> None:
     for ends in (False, True):
         recipe = AntMazeRecipe(episode_steps=80, end_when_flipped=ends)
         recorder = antmaze._Recorder(task, 0, 80, recipe)
-        ant = antmaze._Ant(task, recorder.env().unwrapped)
+        ant = antmaze._Ant(task, recorder.env())
         walk = antmaze._Walk(task, recipe, ant, np.random.default_rng(0), 80)
         qpos = ant.simulator.data.qpos.copy()
         qpos[2:7] = 0.3, 0.0, 1.0, 0.0, 0.0  # on its back
