@@ -28,8 +28,8 @@ def _axes(x: str, y: str, size: tuple[float, float] = (6.4, 3.6)) -> tuple[Figur
 
 
 def _style(index: int) -> str:
-    """Of a line: dashed where the colours begin again."""
-    return "-" if index < COLOURS else "--"
+    """Of a line: another one each time the colours begin again."""
+    return ("-", "--", ":", "-.")[index // COLOURS % 4]
 
 
 def plot_horizon(cells: pd.DataFrame) -> Figure:
