@@ -2,13 +2,16 @@
 
     python benchmarks/online_curves.py Pendulum-v1 --steps 8000 --seeds 3
 
-Both have the settings of `online_speed.py`, which are stable-baselines3's. What is compared is the mean return of the
-latest ten episodes played while learning. Writes `results/online_ENV.parquet` and `.png`; prints the returns at a
-quarter, half and the end, and whether the ranges over the seeds overlap there. Needs stable-baselines3.
+All have the settings of `online_speed.py`, which are stable-baselines3's; ours learns in float32 and in bfloat16. What
+is compared is the mean return of the latest ten episodes played while learning. Writes `results/online_ENV.parquet` and
+`.png`, where learners that are not asked for keep their curves; prints the returns at a quarter, half and the end, and
+whether all ranges over the seeds overlap there. Needs stable-baselines3.
 """
 
 import argparse
 from collections import deque
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +22,7 @@ import torch
 from matplotlib.figure import Figure
 from online_speed import START, train
 
-COLOURS = {"dds-lightning": "#0072b2", "stable-baselines3": "#d55e00"}
+COLOURS = {"dds-lightning": "#0072b2", "dds-lightning, bfloat16": "#56b4e9", "stable-baselines3": "#d55e00"}
 RESULTS = Path(__file__).parent / "results"
 LATEST = 10
 EVERY = 200
@@ -40,10 +43,10 @@ class Watch(pl.Callback):
             self.curve.append((collector.steps, sum(returns) / len(returns)))
 
 
-def ours(env_id: str, steps: int, seed: int) -> list[tuple[int, float]]:
+def ours(env_id: str, steps: int, seed: int, way: str = "float32") -> list[tuple[int, float]]:
     """(environment steps, return) of `dds online fit`."""
     watch = Watch()
-    train(env_id, steps - START, watch, seed)
+    train(env_id, steps - START, watch, seed, way)
     return watch.curve
 
 
@@ -67,12 +70,17 @@ def theirs(env_id: str, steps: int, seed: int) -> list[tuple[int, float]]:
     return curve
 
 
+LEARNERS: dict[str, Callable[..., list[tuple[int, float]]]] = dict(
+    zip(COLOURS, (ours, partial(ours, way="bfloat16"), theirs), strict=True)
+)
+
+
 def draw(table: pd.DataFrame, env_id: str) -> Figure:
     """Every seed as a line."""
     figure = Figure(figsize=(6.4, 3.2), layout="constrained")
     ax = figure.add_subplot()
     for (name, seed), curve in table.groupby(["of", "seed"]):
-        label = name if seed == 0 else None
+        label = name if seed == table.loc[table["of"] == name, "seed"].min() else None
         ax.plot(curve["env_steps"], curve["return"], color=COLOURS[name], alpha=0.8, label=label)
     ax.set(xlabel="environment steps", ylabel=f"return of the latest {LATEST} episodes", title=env_id)
     ax.legend(frameon=False)
@@ -81,25 +89,29 @@ def draw(table: pd.DataFrame, env_id: str) -> Figure:
 
 
 def main() -> None:
-    """Train both with every seed, and compare."""
+    """Train all with every seed, and compare."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("env_id")
     parser.add_argument("--steps", type=int, default=8000)
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--learners", nargs="+", choices=LEARNERS, default=list(LEARNERS))
     asked = parser.parse_args()
     torch.set_num_threads(1)
-    rows = [
-        {"of": name, "seed": seed, "env_steps": step, "return": value}
-        for seed in range(asked.seeds)
-        for name, learn in zip(COLOURS, (ours, theirs), strict=True)
-        for step, value in learn(asked.env_id, asked.steps, seed)
-    ]
-    table = pd.DataFrame(rows)
-    table.to_parquet(RESULTS / f"online_{asked.env_id}.parquet", index=False)
-    draw(table, asked.env_id).savefig(RESULTS / f"online_{asked.env_id}.png", dpi=120)
+    file = RESULTS / f"online_{asked.env_id}.parquet"
+    table = pd.read_parquet(file) if file.is_file() else pd.DataFrame()
+    for name in asked.learners:
+        rows = []
+        for seed in range(asked.seeds):
+            curve = LEARNERS[name](asked.env_id, asked.steps, seed)
+            print(f"{name}, seed {seed}: {curve[-1][1]:.0f}", flush=True)
+            rows += [{"of": name, "seed": seed, "env_steps": step, "return": value} for step, value in curve]
+        others = table[table["of"] != name] if len(table) else table
+        table = pd.concat([others, pd.DataFrame(rows)], ignore_index=True)
+        table.to_parquet(file, index=False)
+    draw(table, asked.env_id).savefig(file.with_suffix(".png"), dpi=120)
     for share in (0.25, 0.5, 1.0):
         at = int(asked.steps * share) // EVERY * EVERY
-        found = table[table["env_steps"] == at].groupby("of")["return"].agg(["min", "mean", "max"])
+        found = table[table["env_steps"] == at].groupby("of")["return"].agg(["min", "mean", "max", "std"])
         apart = found["min"].max() > found["max"].min()
         print(f"{at:,} steps: {'apart' if apart else 'ranges overlap'}\n{found.round(1)}\n")
 
