@@ -21,6 +21,7 @@ from torch import Tensor
 from datamodules.relabel import Relabelled
 from datamodules.relabelled import RelabeledDataModule
 from datamodules.relabelling import Relabelling
+from datamodules.robots import refuse_other_robot
 from dds_lightning.errors import UserError
 from dds_lightning.online.collector import Collector
 from dds_lightning.online.replay import Replay
@@ -112,11 +113,14 @@ class OnlineDataModule(pl.LightningDataModule):
             ("random_steps", random_steps >= 1, "at least 1: the first batch needs transitions"),
             ("num_envs", num_envs >= 1, "at least 1"),
             ("bound", bound > 0, "positive"),
+            ("noise_scale", noise_scale is None or noise_scale >= 0, "null or 0 or more"),
         ]
         for name, fine, expected in rules:
             if not fine:
                 raise UserError(f"data.{name} is {self.hparams[name]}, expected {expected}")
         self.model = None if skill is None else SkillModule.load(skill)
+        if skill is not None:
+            refuse_other_robot(skill, self.task)
         self.skill = self.model if actions == "skills" else None
         self.space = "raw" if self.skill is None else "discrete" if self.skill.discrete else "continuous"
         if data is not None and self.space != "discrete":
@@ -168,6 +172,8 @@ class OnlineDataModule(pl.LightningDataModule):
         """Build the environments, so that what does not fit is found before the first file is written."""
         if stage != "fit":
             raise UserError("an online training has no held-out data: look at the agent with `dds evaluate`")
+        if self.trainer is not None:
+            _refuse_other_rounds(self.trainer)
         if self.loader is not None:
             return
         if self._prior_module is not None:
@@ -200,10 +206,48 @@ class OnlineDataModule(pl.LightningDataModule):
         """None: what counts is how the policy plays."""
         return []
 
+    def state_dict(self) -> dict[str, Any]:
+        """Which prior data the training has."""
+        return {"prior": None if self._prior_module is None else self._prior_module.state_dict()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Refuse to go on with other prior data, with some where there were none, or without.
+
+        Raises:
+            UserError: They differ.
+        """
+        there = state_dict["prior"]
+        if self._prior_module is not None and there is not None:
+            self._prior_module.load_state_dict(there)
+        elif self._prior_module is not None or there is not None:
+            was = "none" if there is None else there["name"]
+            raise UserError(
+                f"data.data is {self.hparams.data or 'not given'}, but the checkpoint's training had {was} as prior "
+                "data: give the same, or start anew from its weights with --model.init_from"
+            )
+
     def teardown(self, stage: str) -> None:
         """Close the environments."""
         if self.loader is not None:
             self.loader.collector.close()
+
+
+def _refuse_other_rounds(trainer: pl.Trainer) -> None:
+    """Refuse a Trainer whose steps are not those that `updates` counts.
+
+    Raises:
+        UserError: It has several processes, which would all collect the same, or adds up several batches.
+    """
+    if trainer.world_size > 1:
+        raise UserError(
+            f"the Trainer has {trainer.world_size} processes, expected 1: online, one process collects for one policy; "
+            "leave out trainer.devices, and raise data.num_envs for more environments side by side"
+        )
+    if trainer.accumulate_grad_batches != 1:
+        raise UserError(
+            f"trainer.accumulate_grad_batches is {trainer.accumulate_grad_batches}, expected 1: data.updates counts "
+            "batches; raise data.batch_size instead"
+        )
 
 
 class OnlineLoader:

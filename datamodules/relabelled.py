@@ -16,6 +16,7 @@ from datamodules.loader import TensorLoader, data_state, overfits, refuse_other_
 from datamodules.partial_codes import PartialCodes
 from datamodules.relabel import Relabelled, refuse_other_transitions, relabel, relabel_key
 from datamodules.relabelling import Relabelling
+from datamodules.robots import refuse_other_robot
 from datamodules.sources import load_trajectories
 from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError, refuse_seed
@@ -80,6 +81,8 @@ class RelabeledDataModule(pl.LightningDataModule):
         if not 0.0 <= validation_fraction < 1.0:
             raise UserError(f"data.validation_fraction is {validation_fraction}, expected a share in [0, 1)")
         self.skill = SkillModule.load(skill)
+        if self.task is not None:
+            refuse_other_robot(skill, self.task)
         self.observation_dim: int = self.skill.hparams.observation_dim
         self.num_skills: int = self.skill.num_skills
         self.skill_hash = self.skill.fingerprint()

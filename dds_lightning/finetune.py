@@ -34,6 +34,8 @@ log = logging.getLogger(__name__)
 
 STATISTICS = ("normaliser.", "action_box.")
 """Buffers that hold statistics; loaded together or not at all."""
+FOLLOWER = "follower."
+"""Skills that learn with an online policy; the checkpoint's, or those of data.skill where it has none."""
 
 
 def read(cls: type[StageModule], path: str) -> StageModule:
@@ -46,7 +48,7 @@ def read(cls: type[StageModule], path: str) -> StageModule:
         with torch.random.fork_rng(devices=[]):
             return cls.load(path)
     except UserError as error:
-        expected = f"expected a .ckpt or a published directory of a {cls.STAGE} model"
+        expected = f"expected a .ckpt or a published directory of stage {cls.STAGE}"
         raise UserError(f"model.init_from is {path}, {expected}: {error}") from None
 
 
@@ -68,6 +70,7 @@ def start_from(module: StageModule, path: str) -> None:
         theirs["bottleneck.ema_sum"] = theirs["bottleneck.vectors"].clone()
         theirs["bottleneck.ema_count"] = torch.ones_like(ours["bottleneck.ema_count"])
     left = {name for name in ours if name in module.OF_DATA}
+    left |= {name for name in ours if name.startswith(FOLLOWER) and name not in theirs}
     shapes = {name: value.shape for name, value in theirs.items()}
     misfits = [name for name, value in ours.items() if name not in left and shapes.get(name) != value.shape]
     if module.hparams.get("refit_normaliser") or any(name.startswith(STATISTICS) for name in misfits):
@@ -107,8 +110,10 @@ def refuse_other_shape(module: StageModule, source: StageModule, path: str) -> N
         remedy = " ".join(
             f"--{'data' if name == 'horizon' else 'model'}.{name}={_plain(there[name])}" for name in differing
         )
-        if "num_skills" in differing and module.STAGE == "policy":
-            remedy = "relabel with the skill model of that policy (data.skill)"
+        chosen = {"num_skills", "choices", "space"}.intersection(differing)  # what follows from the skills
+        if chosen and module.STAGE != "skill":
+            remedy = "the skill model of that policy (data.skill)"
+            remedy += " or its kind of actions (data.actions)" if "space" in chosen else ""
         raise UserError(
             f"{found}, but model.init_from {path} was trained with {was}: give {remedy}, or train from scratch"
         )
@@ -116,7 +121,8 @@ def refuse_other_shape(module: StageModule, source: StageModule, path: str) -> N
 
 def refuse_other_skills(module: StageModule, source: StageModule, path: str) -> None:
     """Refuse a policy that chose among the codes of another skill model: there the same numbers mean other skills."""
-    there, here = (one.hparams.get("skill_hash") for one in (source, module))
+    # What a checkpoint's own decoder learnt belongs to it; where one is about to learn, the data say what it begins as.
+    there, here = source.skill_hash, module.hparams.get("skill_hash")
     if there and here and there != here:
         raise UserError(
             f"data.skill is skill model {short(here)}, but model.init_from {path} was trained on the codes of skill "

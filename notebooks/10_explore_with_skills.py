@@ -98,7 +98,7 @@ def wander(env, steps, seed=0):
         choice = rng.integers(env.action_space.n) if hasattr(env.action_space, "n") else rng.uniform(-1, 1, 2)
         choice = choice if np.isscalar(choice) else choice.astype(np.float32)
         _, _, terminated, truncated, info = env.step(choice)
-        seen.append(info["positions"])
+        seen.append(info["positions"][: info["steps"]])
         taken += info["steps"]
         if terminated or truncated:
             env.reset()

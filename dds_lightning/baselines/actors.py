@@ -42,9 +42,9 @@ class ModuleActor:
 
 
 def of_skills(checkpoints: Checkpoints) -> DDSAgent:
-    """Skills and a policy over them, greedy."""
-    skill, policy = checkpoints.values()
-    return DDSAgent(*checkpoint_parts(skill, policy), "greedy")
+    """Skills and a policy over them, or a policy over raw actions alone; greedy."""
+    *skill, policy = checkpoints.values()
+    return DDSAgent(*checkpoint_parts(skill[0] if skill else None, policy), "greedy")
 
 
 def of_latents(checkpoints: Checkpoints) -> DDSAgent:

@@ -50,8 +50,8 @@ class SeveralUpdates(Callback):
         loader: Any = trainer.train_dataloader
         if not hasattr(loader, "group"):
             raise UserError(
-                f"several updates: the training batches come from a {type(loader).__name__}, expected a data module of "
-                "this project: leave the callback out"
+                f"several updates: the training batches come from {type(loader).__name__}, expected recorded data from "
+                "a data module of this project: leave the callback out"
             )
         loader.group = self.updates
         own: Any = pl_module.training_step

@@ -114,9 +114,9 @@ class _Planner:
 
     def evaluate(self, cell: Cell) -> Node:
         """The evaluation that is a cell."""
-        method, asked = PLAYERS[cell.method], _of(cell.settings, "evaluate")
+        asked, stages = _of(cell.settings, "evaluate"), self._stages(cell)
         made: dict[str, Node] = {"data": self._data(cell)}
-        for stage in method.stages:
+        for stage in stages:
             made[stage] = self._train(cell, stage, made)
         episodes = self._scaled(asked.get("episodes") or get_task(cell.task).evaluation_episodes)
         settings = {**self._task(cell), "method": cell.method, "seed": cell.seed, **self._acting(cell)}
@@ -125,15 +125,23 @@ class _Planner:
             "evaluate",
             "dds_lightning.grid.work:evaluate",
             settings,
-            {stage: made[stage] for stage in method.stages},
+            {stage: made[stage] for stage in stages},
             f"evaluate {cell.name()}",
             {"asked": sorted(asked.keys() - {"episodes"})},
         )
 
+    def _stages(self, cell: Cell) -> tuple[str, ...]:
+        """What the cell trains; learning online over raw actions takes no skills."""
+        stages = PLAYERS[cell.method].stages
+        if "online" not in stages:
+            return stages
+        actions = {**self._preset(cell, "online")[0], **_of(cell.settings, "online")}["data.actions"]
+        return tuple(stage for stage in stages if stage != "skill" or actions != "raw")
+
     def _acting(self, cell: Cell) -> dict[str, Any]:
         """How the agent acts: what was asked for, else the preset's choice where there are skills to choose."""
         run = run_defaults(self.study.preset or get_task(cell.task).family)
-        skilled = "skill" in PLAYERS[cell.method].stages
+        skilled = "skill" in self._stages(cell)
         usual = {name: run[name] for name in ("selection", "temperature", "noise_scale")} if skilled else {}
         chosen = {**usual, **_of(cell.settings, "evaluate")}
         return {name: value for name, value in chosen.items() if value is not None and name != "episodes"}
@@ -166,7 +174,7 @@ class _Planner:
         for name in BUDGETS:
             if isinstance(settings.get(name), int | float) and settings[name] > 0 and study.scale != 1:
                 settings[name] = given[name] = self._scaled(settings[name])
-        reads = {"data": made["data"], **{name: made[name] for name in row.reads}}
+        reads = {"data": made["data"], **{name: made[name] for name in row.reads if name in made}}
         how: dict[str, Any] = {"config": config, "given": {k: v for k, v in given.items() if preset.get(k) != v}}
         if study.watch and stage == PLAYERS[cell.method].stages[-1] and stage in WATCHED:
             steps = int(settings["trainer.max_steps"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,8 @@ def train(settings: Facts, how: Facts, reads: Reads, folder: Path, resuming: boo
     words += [f"--data.task={settings['task']}", f"--data.seed={settings['seed']}"]
     # Online, data would be prior data.
     words += [f"--data.data={_spec(reads)}"] if stage != "online" else []
-    words += [f"--{flag}={reads[read].outputs['checkpoint']}" for read, flag in STAGES[stage].reads.items()]
+    earlier = {flag: reads[read] for read, flag in STAGES[stage].reads.items() if read in reads}
+    words += [f"--{flag}={read.outputs['checkpoint']}" for flag, read in earlier.items()]
     words += [f"--data.cache={reads['relabel'].outputs['cache'].parent}"] if "relabel" in reads else []
     words += _watching(settings["watch"], settings["seed"]) if "watch" in settings else []
     words += [f"--trainer.default_root_dir={folder}", f"--checkpoint.dirpath={folder}", "--trainer.devices=1"]
@@ -74,6 +76,7 @@ def train(settings: Facts, how: Facts, reads: Reads, folder: Path, resuming: boo
 def evaluate(settings: Facts, how: Facts, reads: Reads, folder: Path, resuming: bool) -> Facts:
     """Play the last checkpoint and, where one was kept, the best, in the real environment."""
     method, task = PLAYERS[settings["method"]], get_task(settings["task"])
+    method = replace(method, stages=tuple(stage for stage in method.stages if stage in reads))  # raw: without skills
     last = {stage: str(reads[stage].outputs["checkpoint"]) for stage in method.stages}
     ends = {LAST: last}
     final = reads[method.stages[-1]]

@@ -85,7 +85,7 @@ class Collector:
         self.returns[number] += info["env_return"]
         self.success[number] |= info["success"]
         if self.cell_of is not None and "positions" in info:
-            rows, columns = self.cell_of(info["positions"]).T
+            rows, columns = self.cell_of(info["positions"][: info["steps"]]).T
             np.add.at(self.visits, (rows, columns), 1)
 
     def _begin(self, number: int) -> None:

@@ -14,10 +14,50 @@ from torch import Tensor
 
 from dds_lightning.errors import UserError
 from dds_lightning.policy import PolicyModule
+from dds_lightning.saving.files import short
 
 SHAPE = ("observation_dim", "hidden_dims", "fourier_features", "fourier_seen", "layer_norm")
 LESSONS, LESSON_SIZE, LESSON_RATE = 2_000, 512, 1e-3
 """Steps, states in a step, and learning rate with which a policy in closed form becomes a network."""
+
+
+def one_start(offline: Any, init_from: Any) -> str | None:
+    """The offline policy to start from, if there is one.
+
+    Raises:
+        UserError: Another checkpoint to start from was given too.
+    """
+    if offline is not None and init_from is not None:
+        raise UserError(
+            f"model.offline is {offline} and model.init_from is {init_from}, expected one of them: weights can start "
+            "from an offline policy or from an online training"
+        )
+    return None if offline is None else str(offline)
+
+
+def refuse_other_policy(policy: PolicyModule, path: str, skill_hash: str | None, choices: int) -> None:
+    """Refuse an offline policy over other codes.
+
+    Args:
+        policy: Of `path`.
+        path: Where it is, for the message.
+        skill_hash: Fingerprint of the skill model whose codes are to be chosen; None if it is unknown.
+        choices: K of that model.
+
+    Raises:
+        UserError: It chooses among the codes of another model.
+    """
+    there = policy.hparams
+    if there.skill_hash and skill_hash and there.skill_hash != skill_hash:
+        raise UserError(
+            f"model.offline: {path} was trained on skill model {short(there.skill_hash)}, data.skill is "
+            f"{short(skill_hash)}: give the skill model that it was trained on"
+        )
+    if there.num_skills != choices:
+        raise UserError(
+            f"data.skill has {choices} codes, but the policy in {path} chooses among {there.num_skills}: give the "
+            "skill model that it was trained on"
+        )
 
 
 @torch.no_grad()
@@ -41,11 +81,8 @@ def start_offline(module: Any, path: str, states: Tensor | None = None) -> None:
         raise UserError(
             f"model.offline is {path}, a policy over codes, but the choices are {here.space}: expected discrete"
         )
-    if there.skill_hash and here.skill_hash and there.skill_hash != here.skill_hash:
-        raise UserError(
-            f"model.offline: {path} chooses among the codes of another skill model than data.skill: give that"
-        )
-    pairs = {"choices": (here.choices, there.num_skills), **{name: (here[name], there[name]) for name in SHAPE}}
+    refuse_other_policy(policy, path, here.skill_hash, here.choices)
+    pairs = {name: (here[name], there[name]) for name in SHAPE}
     for name, (ours, theirs) in pairs.items():
         if ours != theirs:
             raise UserError(f"model.{name} is {ours}, but the policy in {path} has {theirs}: give the same")

@@ -33,7 +33,7 @@ from dds_lightning.nn.normaliser import ActionBox, Normaliser
 from dds_lightning.online.follower import Follower
 from dds_lightning.online.heads import BoxHead, CodeHead
 from dds_lightning.online.novelty import Novelty
-from dds_lightning.online.offline import start_offline
+from dds_lightning.online.offline import one_start, start_offline
 
 Space = Literal["discrete", "continuous", "raw"]
 Pessimism = Literal["min", "mean"]
@@ -158,8 +158,8 @@ class SACModule(StageModule):
         self.register_buffer("target_entropy", torch.tensor(aim))
         self.value_range = torch.tensor([-torch.inf, torch.inf])  # what comes is not known: no value is impossible
         self.register_buffer("support_mask", torch.ones(self.num_skills, dtype=torch.bool))
+        self._offline = one_start(offline, init_from)
         self._begin(init_from)
-        self._offline = None if offline is None else str(offline)
 
     # ---------------------------------------------------------------- choosing
 

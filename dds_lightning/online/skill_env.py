@@ -36,7 +36,8 @@ class SkillEnv(gym.Wrapper[NDArray[np.float32], Any, NDArray[np.float32], Any], 
 
     `info` has what the environment says after the last step, and `steps` (h, fewer than H where the episode ended
     inside the skill), `discount` (factor on the bootstrap), `env_return` (sum of the environment's rewards), `success`
-    (whether any step said so) and, where the environment tells its position, `positions` (h, 2).
+    (whether any step said so) and, where the environment tells its position, `positions` (H, 2), NaN
+    after the last step.
 
     The same seed and the same actions give the same episode: the decoder's noise has its own stream.
 
@@ -116,7 +117,15 @@ class SkillEnv(gym.Wrapper[NDArray[np.float32], Any, NDArray[np.float32], Any], 
     # ---------------------------------------------------------------- a skill step by step, for a batch of environments
 
     def begin(self, action: Any) -> None:
-        """Start a skill; `advance` plays its steps and `finish` gives what `step` returns."""
+        """Start a skill; `advance` plays its steps and `finish` gives what `step` returns.
+
+        Raises:
+            UserError: It is no skill of the model, or no episode has begun.
+        """
+        if self._observation is None:
+            raise UserError("no episode has begun: call reset() before the first skill")
+        if isinstance(space := self.action_space, gym.spaces.Discrete) and not space.contains(np.int64(action)):
+            raise UserError(f"the action is {action}, expected a code from 0 to {space.n - 1}")
         self.chosen = action
         self.over = False
         self._rewards: list[float] = []
@@ -141,8 +150,9 @@ class SkillEnv(gym.Wrapper[NDArray[np.float32], Any, NDArray[np.float32], Any], 
         (folded,), (factor,) = fold(learning, START, np.array([steps]), self.gamma, self.discount)
         info = {**self._info, "steps": steps, "discount": float(factor)}
         info |= {"env_return": sum(self._rewards), "success": self._success}
-        if self._positions:
-            info["positions"] = np.asarray(self._positions)  # (h, 2)
+        if self._positions:  # always H rows, because `gymnasium.vector` stacks the arrays of its environments
+            unplayed = [np.full_like(self._positions[0], np.nan, np.float64)] * (self.horizon - len(self._positions))
+            info["positions"] = np.asarray([*self._positions, *unplayed])
         return self._observation, float(folded), *self._ended, info
 
     @property

@@ -16,22 +16,26 @@ import numpy as np
 import pandas as pd
 from rich.console import Console
 
+from datamodules.online import OnlineDataModule
 from dds_lightning.agent import DDSAgent
 from dds_lightning.console.refusals import did_you_mean
 from dds_lightning.console.reports import Report, table
 from dds_lightning.errors import UserError
 from dds_lightning.interpret.draw.online import plot_comparison
+from dds_lightning.online.offline import refuse_other_policy
 from dds_lightning.online.parts import checkpoint_parts
+from dds_lightning.policy import PolicyModule
 from dds_lightning.rollout.actors import Contestant
 from dds_lightning.rollout.play import rollout
 from dds_lightning.saving.arrays import read_npy
 from dds_lightning.saving.checkpoint import load_ckpt
 from dds_lightning.saving.files import sha256
-from dds_lightning.saving.run_directory import Done, RunDirectory, locked, write_json
+from dds_lightning.saving.run_directory import Done, RunDirectory, locked
 from dds_lightning.saving.untrusted import read_csv
 from dds_lightning.tasks import facts_to_keep, get_task
 from dds_lightning.training.stage_cli import command, settings_of
 
+Facts = Mapping[str, Any]
 CURVE = {
     "online/env_steps": "env_steps",
     "online/success": "success",
@@ -107,23 +111,18 @@ def compare(asked: Comparison) -> Report:
     variants = asked.variants()
     prepared = {name: _arguments(asked, more) for name, more in variants.items()}
     settings = {name: _settings(asked, arguments) for name, arguments in prepared.items()}
+    _refuse_misfits(prepared)
     with locked(asked.out):
         directory = RunDirectory(asked.out, Console(stderr=True))
         done = {
-            (name, seed): directory.do(
-                f"{name.replace(', ', '-').replace(' ', '-')}/{seed}",
-                f"{name}, seed {seed}",
-                settings[name],
-                [],
-                partial(_train, asked, name, seed, prepared[name]),
-            )
+            (name, seed): _do(asked, directory, name, seed, prepared[name], settings[name])
             for name in variants
             for seed in range(asked.seeds)
         }
         rows = _table(variants, asked.seeds, done)
         rows.to_csv(asked.out / "table.csv", index=False)
-        curves = {key: read_csv(one.outputs["curve"], {"env_steps": "iuf"}) for key, one in done.items()}
-        visits = {key: read_npy(one.outputs["visits"]) for key, one in done.items()}
+        curves = {key: read_csv(one.outputs["curve"], {"env_steps": "iuf"}) for key, (one, _) in done.items()}
+        visits = {key: read_npy(one.outputs["visits"]) for key, (one, _) in done.items()}
         figure = asked.out / "comparison.png"
         plot_comparison(task, curves, visits).savefig(figure, dpi=150)
     files = () if asked.chosen else ("skill", "gaussian", "data", "policy")
@@ -147,18 +146,36 @@ def _arguments(asked: Comparison, more: Sequence[str]) -> list[str]:
     return [*arguments, f"--trainer.max_steps={steps}", f"--trainer.log_every_n_steps={often}"]
 
 
+def _refuse_misfits(prepared: Mapping[str, Sequence[str]]) -> None:
+    """Build what each variant would train, without training it.
+
+    Raises:
+        UserError: A file is missing or of another kind, or a policy is one over other skills.
+    """
+    for name, arguments in prepared.items():
+        config = settings_of("online", arguments)
+        data = OnlineDataModule(**config["data"])
+        expected = {"discrete skills": "discrete", "continuous skills": "continuous"}.get(name, data.space)
+        if data.space != expected:
+            flag, other = ("skill", "gaussian") if expected == "discrete" else ("gaussian", "skill")
+            raise UserError(
+                f"--{flag} is {data.hparams.skill}, whose skills are {data.space}, expected {expected}: give it as "
+                f"--{other}"
+            )
+        if path := config["model"]["offline"]:
+            refuse_other_policy(PolicyModule.load(path), path, data.skill_hash, data.choices)
+
+
 def _settings(asked: Comparison, arguments: Sequence[str]) -> dict[str, Any]:
     """What a training's result depends on: its settings, and what the files hold instead of where they are."""
     config = settings_of("online", arguments)
-    files = {name: _content(getattr(asked, name)) for name in ("skill", "gaussian", "policy")}
+    places = {"skill": config["data"]["skill"], "policy": config["model"]["offline"]}
     data = {name: value for name, value in config["data"].items() if name not in ("skill", "cache", "seed")}
-    model = {name: value for name, value in config["model"].items() if name != "offline"}
     return {
-        "model": model,
+        "model": {name: value for name, value in config["model"].items() if name != "offline"},
         "data": data,
         "steps": config["trainer"]["max_steps"],
-        "files": files,
-        "play": asked.episodes,
+        "files": {name: _content(place) for name, place in places.items() if place},
     }
 
 
@@ -171,10 +188,19 @@ def _content(path: str | None) -> str | None:
     return sha256(file) if file.is_file() else None
 
 
-def _train(
-    asked: Comparison, name: str, seed: int, prepared: Sequence[str], folder: Path, resuming: bool
-) -> Mapping[str, Any]:
-    """One training, its curve, its map, and how its agent plays."""
+def _do(
+    asked: Comparison, directory: RunDirectory, name: str, seed: int, prepared: Sequence[str], settings: Facts
+) -> tuple[Done, Done]:
+    """One training, and its agent at play; neither is repeated where it was done."""
+    place, title = f"{name.replace(', ', '-').replace(' ', '-')}/{seed}", f"{name}, seed {seed}"
+    trained = directory.do(place, title, settings, [], partial(_train, seed, prepared))
+    play = {"episodes": asked.episodes, "seed": seed}
+    work = partial(_play, asked, name, seed, trained)
+    return trained, directory.do(f"{place}-played", f"{title}, at play", play, [trained], work)
+
+
+def _train(seed: int, prepared: Sequence[str], folder: Path, resuming: bool) -> Mapping[str, Any]:
+    """One training, its curve and its map."""
     last = folder / "last.ckpt"
     arguments = [*prepared, f"--seed_everything={seed}", f"--trainer.default_root_dir={folder}"]
     arguments += [f"--checkpoint.dirpath={folder}", "--trainer.enable_model_summary=false"]
@@ -187,26 +213,28 @@ def _train(
     curve.to_csv(folder / "curve.csv", index=False)
     visits = load_ckpt(last)["loops"]["fit_loop"]["state_dict"]["combined_loader"][0]["collector"]
     np.save(folder / "visits.npy", visits["visits"].numpy())
+    collected = {key: float(value) for key, value in curve.iloc[-1].to_dict().items()}
+    return {"curve": folder / "curve.csv", "visits": folder / "visits.npy", "checkpoint": last, "collected": collected}
+
+
+def _play(asked: Comparison, name: str, seed: int, trained: Done, folder: Path, resuming: bool) -> Mapping[str, Any]:
+    """How the agent of a training plays, and the agent published with it."""
     task = get_task(asked.task)
     skill = None if name == "raw actions" else asked.gaussian if name == "continuous skills" else asked.skill
-    agent = DDSAgent(*checkpoint_parts(skill, str(last)), seed=seed)
+    agent = DDSAgent(*checkpoint_parts(skill, str(trained.outputs["checkpoint"])), seed=seed)
     result = rollout(task, [Contestant(name, agent, asked.episodes)], seed=seed, workers=asked.workers)
     (played,) = json.loads(result.summary().to_json(orient="records"))
     metrics = {"episodes": asked.episodes, "seed": seed, "results": [played]}
-    place = agent.save(folder / "agent", metrics=metrics, **facts_to_keep(task))
-    write_json(folder / "played.json", played)
-    collected = curve.iloc[-1].to_dict()
-    facts = {"played": played, "collected": {key: float(value) for key, value in collected.items()}}
-    return {"curve": folder / "curve.csv", "visits": folder / "visits.npy", "agent": place, **facts}
+    return {"agent": agent.save(folder / "agent", metrics=metrics, **facts_to_keep(task)), "played": played}
 
 
-def _table(variants: Mapping[str, Any], seeds: int, done: Mapping[tuple[str, int], Done]) -> pd.DataFrame:
+def _table(variants: Mapping[str, Any], seeds: int, done: Mapping[tuple[str, int], tuple[Done, Done]]) -> pd.DataFrame:
     """One row a variant: means over seeds, with the standard deviation (ddof 1) of what agents reach when they play."""
     rows = []
     for name in variants:
-        facts = [done[name, seed].facts for seed in range(seeds)]
-        played = pd.DataFrame([fact["played"] for fact in facts])
-        collected = pd.DataFrame([fact["collected"] for fact in facts])
+        pairs = [done[name, seed] for seed in range(seeds)]
+        collected = pd.DataFrame([trained.facts["collected"] for trained, _ in pairs])
+        played = pd.DataFrame([play.facts["played"] for _, play in pairs])
         measure = "score" if played["success"].isna().all() else "success"
         rows.append(
             {

@@ -52,6 +52,18 @@ def play_baselines(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
     return {"episodes": folder / "episodes.parquet"}
 
 
+def publish_played(run: Run, agent: DDSAgent, name: str, place: Path) -> Mapping[str, Any]:
+    """Let an agent play that was trained after the report, and publish it with what it reached."""
+    from dds_lightning.rollout.actors import Contestant
+    from dds_lightning.rollout.play import rollout
+
+    wanted, task = run.wanted, run.task
+    result = rollout(task, [Contestant(name, agent, run.episodes)], seed=wanted.seed, workers=wanted.workers)
+    (played,) = json.loads(result.summary().to_json(orient="records"))
+    metrics = {"episodes": run.episodes, "seed": wanted.seed, "results": [played]}
+    return {"agent": agent.save(place, metrics=metrics, **facts_to_keep(task)), "played": played}
+
+
 def evaluate(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
     """Publish the agent and let everyone in the table play."""
     from dds_lightning.agent import DDSAgent

@@ -142,9 +142,10 @@ def _fit(stage: str, best: str, publish: bool, run: Run, folder: Path, resuming:
     if publish:
         from dds_lightning.agent import DDSAgent
         from dds_lightning.online.parts import checkpoint_parts
+        from dds_lightning.pipeline.evaluating import publish_played
 
         agent = DDSAgent(*checkpoint_parts(str(skill), str(made["checkpoint"])), seed=run.wanted.seed)
-        made["agent"] = agent.save(folder / "agent", **facts_to_keep(run.task))
+        made |= publish_played(run, agent, stage, folder / "agent")
     return made
 
 

@@ -320,7 +320,7 @@ def _put_away(folder: Path, root: Path) -> None:
     """Move a step's folder to `previous/`, in place of what was there."""
     if not folder.exists():
         return
-    previous = root / PREVIOUS / folder.name
+    previous = root / PREVIOUS / folder.relative_to(root)
     remove_tree(previous, root)
     previous.parent.mkdir(parents=True, exist_ok=True)
     os.replace(folder, previous)

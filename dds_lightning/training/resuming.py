@@ -89,5 +89,5 @@ def load_checkpoint(path: str, stage: str) -> dict[str, Any]:
         raise UserError(f"--ckpt_path: {error}") from None
     saved = stage_of(checkpoint)
     if saved != stage:
-        raise UserError(f"--ckpt_path: {path} is a checkpoint of a {saved or 'other'} model, expected a {stage} model")
+        raise UserError(f"--ckpt_path: {path} is a checkpoint of stage {saved or 'unknown'}, expected {stage}")
     return checkpoint

@@ -272,6 +272,7 @@ class StageCLI(LightningCLI):
     def _execute(self) -> Report:
         if self.trainer.world_size == 1:
             # Lightning makes its log folder first and looks at the data afterwards.
+            self.datamodule.trainer = self.trainer
             self.datamodule.prepare_data()
             self.datamodule.setup(str(self.subcommand))
         if self.subcommand == "fit":

@@ -2,6 +2,7 @@
 
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from dds_lightning.online.sac import SACModule
 from dds_lightning.skill import SkillModule
 from tests.fits import TASK, of_data, skill_of, told
 
+CHECKPOINTS = Path(__file__).parents[2] / "checkpoints"
 SPACES = ["discrete", "continuous", "raw"]
 QUIET = ["--trainer.enable_progress_bar=false", "--trainer.enable_model_summary=false", "--trainer.accelerator=cpu"]
 TINY = ["--data.batch_size=16", "--data.random_steps=60", "--data.num_envs=2", "--data.updates=0.1"]
@@ -183,7 +185,19 @@ def test_a_full_replay_forgets_the_oldest():
         (["--data.actions=raw", "--data.random_steps=0"], "data.random_steps is 0, expected at least 1"),
         (["--data.actions=raw", "--data.data=local:x"], "data.data is local:x, but raw choices have no codes"),
         (["--data.actions=raw", "--data.reward_scale=auto"], "data.reward_scale is auto, expected a number or null"),
-        (["--data.skill={discrete}", "--data.task=hopper-medium"], "the skill model has observation_dim 4, .* has 11"),
+        (
+            ["--data.skill={discrete}", "--data.task=hopper-medium"],
+            r"pointmaze-umaze-diverse \(pointmaze\), but data.task is hopper-medium \(hopper\), another robot",
+        ),
+        (
+            [f"--data.skill={CHECKPOINTS / 'walker2d-medium-expert'}", "--data.task=halfcheetah-medium"],
+            r"\(walker2d\), but data.task is halfcheetah-medium \(halfcheetah\), another robot: give skills of that",
+        ),
+        (["--data.skill={discrete}", "--data.noise_scale=-1"], "data.noise_scale is -1.0, expected null or 0 or more"),
+        (
+            ["--data.skill={discrete}", "--trainer.accumulate_grad_batches=2", "--trainer.max_steps=1"],
+            "trainer.accumulate_grad_batches is 2, expected 1: data.updates counts batches",
+        ),
     ],
 )
 def test_bad_input_gets_one_sentence(dds, skills, tmp_path, arguments, sentence):
@@ -202,6 +216,42 @@ def test_a_checkpoint_of_another_task_or_other_skills_is_refused(dds, data, skil
     seven = skill_of(data, tmp_path / "seven", 1, "--model.num_skills=7")
     more = dds(*common, f"--data.task={TASK}", f"--data.skill={seven}")
     assert "was trained with choices 4, the data have 7" in told(more.err)
+
+
+def test_prior_data_stay_the_same_in_a_training_that_goes_on(dds, data, skills, tmp_path):
+    (spec,) = [word.partition("=")[2] for word in data if word.startswith("--data.data=")]
+    prior = [f"--data.data={spec}", f"--data.cache={tmp_path / 'relabel'}"]
+    common = ["online", "fit", *QUIET, *TINY, f"--data.task={TASK}", f"--data.skill={skills['discrete']}"]
+    common.append(f"--trainer.default_root_dir={tmp_path}")
+    with_them = fit(dds, "discrete", skills, tmp_path / "with", 2, *prior)
+    answer = dds(*common, f"--ckpt_path={with_them}")
+    assert "data.data is not given, but the checkpoint's training had pointmaze" in told(answer.err)
+    without = fit(dds, "discrete", skills, tmp_path / "without", 2)
+    answer = dds(*common, *prior, f"--ckpt_path={without}")
+    assert "but the checkpoint's training had none as prior data: give the same" in told(answer.err)
+
+
+def test_an_agent_whose_decoder_followed_is_fine_tuned_with_its_own_skills(dds, skills, tmp_path):
+    followed = fit(dds, "discrete", skills, tmp_path / "followed", 5, "--model.follow=1e-3")
+    given = ["--skill", skills["discrete"], "--policy", followed, "--task", TASK]
+    assert dds("publish", "-", tmp_path / "agent", *given).status == 0
+    place, more = tmp_path / "agent", f"--model.init_from={tmp_path / 'agent'}"
+    tuned = fit(dds, "discrete", {"discrete": place}, tmp_path / "tuned", 2, more)
+    assert SACModule.load(tuned).skill_hash == SACModule.load(followed).skill_hash
+    common = ["online", "fit", *QUIET, *TINY, f"--data.task={TASK}", f"--trainer.default_root_dir={tmp_path}"]
+    answer = dds(*common, f"--data.skill={skills['discrete']}", more)
+    assert "was trained on the codes of skill model" in told(answer.err)
+    plain = fit(dds, "discrete", skills, tmp_path / "plain", 2)
+    answer = dds(
+        *common,
+        f"--data.skill={skills['discrete']}",
+        f"--model.init_from={plain}",
+        "--model.follow=1e-3",
+        "--trainer.max_steps=2",
+        f"--checkpoint.dirpath={tmp_path / 'last'}",
+    )
+    assert answer.status == 0, answer.err
+    assert "start anew" not in answer.err
 
 
 def test_nothing_is_held_out_online(dds, skills, tmp_path):

@@ -237,8 +237,13 @@ def test_an_offline_policy_that_does_not_fit_is_refused(tmp_path, space, theirs,
         start_offline(module_of(space), path)
 
 
+def test_weights_start_from_one_checkpoint():
+    with pytest.raises(UserError, match=r"model.offline is a.ckpt and model.init_from is b.ckpt, expected one of them"):
+        SACModule(WIDTH, "discrete", K, offline="a.ckpt", init_from="b.ckpt")
+
+
 def test_another_number_of_codes_is_refused(tmp_path):
     _, path = offline(tmp_path)
     module = copy.copy(SACModule(WIDTH, "discrete", K + 1, hidden_dims=[16, 16]))
-    with pytest.raises(UserError, match=f"model.choices is {K + 1}, but the policy in .* has {K}"):
+    with pytest.raises(UserError, match=f"data.skill has {K + 1} codes, but the policy in .* among {K}"):
         start_offline(module, path)

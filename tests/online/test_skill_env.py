@@ -57,6 +57,8 @@ def test_a_skill_is_one_step_and_may_end_early(end):
     assert (observation[0], reward, info["steps"], info["discount"]) == (5, 4 + 5 / 2, 2, 0.5**2)
     assert (terminated, truncated) == (end == "terminated", end == "truncated")
     assert info["success"] is False
+    assert info["positions"][:2, 0].tolist() == [4, 5]
+    assert np.isnan(info["positions"][2]).all()  # always H rows, as `gymnasium.vector` needs
 
 
 @pytest.mark.parametrize("discount", ["per_skill", "per_step"])
@@ -129,6 +131,10 @@ def test_an_episode_is_taken_up_again_to_the_bit():
 
 
 def test_it_is_vectorised_by_gymnasium():
+    # The last ends inside its first skill, which the others play to the end.
+    ragged = gym.vector.SyncVectorEnv([lambda steps=steps: SkillEnv(Count(steps), skill_of()) for steps in (5, 5, 2)])
+    ragged.reset(seed=0)
+    assert ragged.step(np.array([0, 1, 2]))[-1]["steps"].tolist() == [3, 3, 2]
     vector = gym.vector.SyncVectorEnv([lambda: SkillEnv(Count(5), skill_of())] * 3)
     observations, _ = vector.reset(seed=[1, 2, 3])
     assert observations.shape == (3, 2)
@@ -140,6 +146,16 @@ def test_it_is_vectorised_by_gymnasium():
     assert terminated.all()
     assert not truncated.any()
     assert infos["steps"].tolist() == [2, 2, 2]
+
+
+def test_what_is_no_skill_is_refused():
+    env = SkillEnv(Count(5), skill_of())
+    with pytest.raises(UserError, match=r"no episode has begun: call reset\(\) before the first skill"):
+        env.step(0)
+    env.reset(seed=0)
+    for code in (-1, 4):
+        with pytest.raises(UserError, match=f"the action is {code}, expected a code from 0 to 3"):
+            env.step(code)
 
 
 @pytest.mark.parametrize(

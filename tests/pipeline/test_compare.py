@@ -33,11 +33,14 @@ def test_variants_are_trained_once_and_compared(dds, tmp_path):
         assert 0 <= row["success"] <= 100
         assert row["cells"] >= 1
     assert (tmp_path / "out" / "comparison.png").stat().st_size > 10_000
-    assert (tmp_path / "out" / "raw-actions" / "1" / "agent" / "model.safetensors").is_file()
+    assert (tmp_path / "out" / "raw-actions" / "1-played" / "agent" / "model.safetensors").is_file()
     (tmp_path / "out" / "raw-actions" / "1" / "curve.csv").unlink()
     again = dds(*words)
     assert again.json["table"] == answer.json["table"]
-    assert again.err.count("done before") == 7
+    assert again.err.count("done before") == 7 + 8  # made again bit for bit, so it need not play again
+    other = dds(*[word for word in words if word not in ("--gaussian", gaussian)], "--episodes=2")
+    assert other.status == 0, other.err
+    assert other.err.count("done before") == 6  # nothing is trained again for other files or more episodes
 
 
 def test_too_few_steps_are_refused_before_anything_is_made(dds, tmp_path):
@@ -76,6 +79,14 @@ def test_a_variant_that_cannot_be_is_refused(dds, tmp_path, words, sentence):
     answer = dds("online", "compare", TASK, *words.split(), "--out", tmp_path / "out")
     assert answer.status == 2
     assert sentence in told(answer.err)
+    assert not (tmp_path / "out").exists()
+
+
+def test_skills_of_the_wrong_kind_are_refused_before_the_first_training(dds, tmp_path):
+    gaussian = skill_of(of_data(tmp_path / "data"), tmp_path / "gaussian", 1, "--model.bottleneck=gaussian")
+    answer = dds("online", "compare", TASK, "--skill", gaussian, "--out", tmp_path / "out")
+    assert answer.status == 2
+    assert "whose skills are continuous, expected discrete: give it as --gaussian" in told(answer.err)
     assert not (tmp_path / "out").exists()
 
 

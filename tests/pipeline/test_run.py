@@ -309,6 +309,9 @@ def test_a_finished_run_goes_on_online_with_its_data_and_skills(finished, capsys
     assert said["done_before"] == STAGES
     agent = DDSAgent.load(said["outputs"]["online"]["agent"])
     assert agent.policy.STAGE == "online"
+    assert said["online"]["episodes"] == 2
+    told = json.loads((Path(said["outputs"]["online"]["agent"]) / "metrics.json").read_text())
+    assert told["results"][0]["score"] == said["online"]["score"]
     assert agent.skill.fingerprint() == DDSAgent.load(finished / "agent").skill.fingerprint()
     assert call(capsys, *words)[1]["done_before"] == [*STAGES, "online"]
 

@@ -70,7 +70,7 @@ def test_a_checkpoint_of_a_new_stage_is_no_other_stages(dds, data, tmp_path):
     checkpoint = fit(dds, data, tmp_path, 2)
     answer = dds("skill", "fit", *data, *QUIET, f"--ckpt_path={checkpoint}")
     assert answer.status == 2
-    assert "is a checkpoint of a forward model, expected a skill model" in told(answer.err)
+    assert "is a checkpoint of stage forward, expected skill" in told(answer.err)
 
 
 def test_a_new_stage_is_published_and_starts_another_training(dds, data, tmp_path):

@@ -36,7 +36,7 @@ def plot_comparison(task: Task, curves: Mapping[Key, pd.DataFrame], visits: Mapp
     measure = "success" if task.measures_success else "return"
     for name, colour in zip(names, COLOURS, strict=False):
         steps, values = on_one_grid([curve for (owner, _), curve in curves.items() if owner == name], measure)
-        mean, std = values.mean(axis=0), values.std(axis=0)
+        mean, std = values.mean(axis=0), values.std(axis=0, ddof=min(1, len(values) - 1))
         ax.plot(steps, mean, color=colour, label=name)
         ax.fill_between(steps, mean - std, mean + std, color=colour, alpha=0.2, linewidth=0)
     ax.set_xlabel("environment steps")
