@@ -171,7 +171,7 @@ class OnlineDataModule(pl.LightningDataModule):
     def setup(self, stage: str | None = None) -> None:
         """Build the environments, so that what does not fit is found before the first file is written."""
         if stage != "fit":
-            raise UserError("an online training has no held-out data: look at the agent with `dds evaluate`")
+            raise UserError("online training has no held-out data: measure the agent with `dds evaluate`")
         if self.trainer is not None:
             _refuse_other_rounds(self.trainer)
         if self.loader is not None:

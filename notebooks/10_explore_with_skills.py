@@ -14,7 +14,7 @@
 # # 10 · Explore with skills: online RL in a maze
 #
 # **What you will see:** how far chance gets in a maze, with skills and with raw actions; any environment turned into
-# one whose action is a skill; SAC that learns online to reach a goal of which it hears only when it stands on it; and
+# one whose action is a skill; SAC that learns online to reach a goal it learns about only by reaching it; and
 # the same SAC with raw actions, side by side.
 #
 # **Time:** about five minutes on two CPU cores. No network, no GPU, no graphics driver.
@@ -85,7 +85,7 @@ pd.Series(
 # %% [markdown]
 # ## How far does chance get?
 #
-# Two wanderers have the same number of environment steps and start from the same cell. One draws a new action in every
+# Two wanderers have the same number of environment steps and start from the same cell. One draws a new action at every
 # step, the other a new skill every ten. Neither has a goal.
 
 
@@ -124,7 +124,7 @@ for ax, (name, path) in zip(figure.subplots(1, 2), paths.items(), strict=True):
 figure
 
 # %% [markdown]
-# Random pushes cancel each other, so the first one trembles about its start. A skill is ten pushes that belong
+# Random pushes cancel each other, so the first one jitters around its start. A skill is ten pushes that belong
 # together: it crosses a cell, and a row of random skills goes somewhere. That is all that skills have to do with
 # exploration, and it is much.
 #
@@ -137,7 +137,7 @@ figure
 
 # %%
 def curves():
-    """Success of the latest 20 episodes, as far as the trainings have come."""
+    """Success of the latest 20 episodes, so far."""
     figure = Figure(figsize=(7, 2.6), layout="constrained")
     ax = figure.subplots()
     for name, colour in (("discrete skills", "#0072b2"), ("raw actions", "#d55e00")):
@@ -199,7 +199,7 @@ Image(told["figure"])
 #
 # ## The agent
 #
-# What came out is an agent like any other: it plays, is published, exported and drawn by the same commands.
+# The result is an agent like any other: it plays, is published, exported and drawn by the same commands.
 
 # %%
 agent = DDSAgent.load(RUNS / "compare/discrete-skills/0/agent", seed=0)
@@ -232,7 +232,7 @@ checks.round(2)
 # %% [markdown]
 # ## Exercises
 #
-# From the top of the repository, three seeds and the paper's budget (about an hour):
+# From the top of the repository, three seeds and 150,000 environment steps (about an hour):
 #
 # ```bash
 # dds online compare pointmaze-large-diverse --skill checkpoints/pointmaze-large --seeds 3 --out runs/online
@@ -248,7 +248,7 @@ checks.round(2)
 #
 # 1. An entropy of 0.98 log K is nearly that of a policy that draws codes at random, and the temperature rises until the
 #    policy has it: it finds the goal, and can hardly decide to go there again.
-# 2. Half of every batch are drives of the recordings, some of which pass the goal: the critics know where it is before
+# 2. Half of every batch comes from the recordings, some of which pass the goal: the critics know where it is before
 #    the agent has been there.
 # 3. Little, in this maze: the offline policy already arrives. What remains is to become faster, and to correct
 #    what the critics believe about skills that the recordings never tried.

@@ -198,6 +198,15 @@ def test_an_environment_in_a_module_of_ones_own_with_a_box_of_its_own_goes_throu
     assert call("publish", "-", "agent", *parts) == 0
     assert call("checkpoints", "verify", "agent") == 0
     assert call("evaluate", "agent", "--task", arms, "--episodes", 2, "--workers", 1) == 0
+    few = ["--episodes=1", "--episodes_per_skill=1", "--clone_steps=3", "--workers=0", "--evaluate_every=0"]
+    few += ["--skill.model.num_skills=2", "--skill.model.hidden_dim=16", "--policy.model.hidden_dims=[16]"]
+    few += ["--skill.data.validation_fraction=0.2", "--policy.data.validation_fraction=0.2"]
+    few += [f"--{stage}.trainer.{word}" for stage in ("skill", "policy") for word in ("max_steps=3", "accelerator=cpu")]
+    assert call("run", arms, "--data=arrays:data", "--out=run", *few) == 0
+    monkeypatch.setattr("dds_lightning.tasks._OWN", {})  # as in another process
+    assert call("report", "run", "--task", arms) == 0
+    monkeypatch.setattr("dds_lightning.tasks._OWN", {})
+    assert call("publish", "run", "of-run", "--task", arms) == 0
     agent = DDSAgent.load("agent", seed=0)
     actions = np.concatenate([agent.act(episode["observations"]) for episode in episodes])
     assert ((actions >= low) & (actions <= high)).all()

@@ -93,6 +93,18 @@ def test_a_robot_of_ones_own_gets_from_arrays_to_a_score_as_shown(capsys):
     assert '"task": "reacher"' in capsys.readouterr().out
 
 
+def test_a_checkpoint_is_fine_tuned_as_shown():
+    """Both commands, with the presets of today and agents that were trained before them; a few steps on a few data."""
+    assert main(["data", "collect", "pointmaze-large-diverse", "--steps=1000", "--workers=1", "--out=data"]) == 0
+    Path("checkpoints").symlink_to(ROOT / "checkpoints")
+    tuning = [words for words in DDS if "--model.init_from" in words]
+    assert [words[0] for words in tuning] == ["skill", "policy"]
+    for words in tuning:
+        few = ["--trainer.max_steps=2", "--trainer.accelerator=cpu", "--trainer.limit_val_batches=1"]
+        assert main([*words, *few, "--stop.when=steps" if words[0] == "skill" else "--trainer.logger=false"]) == 0
+        assert Path("runs", f"{words[0]}-tuned", "last.ckpt").is_file()
+
+
 def test_scripts_of_ones_own_train_as_shown():
     """The plain Trainer, with our data modules and with a loader of one's own; a few steps on a few data."""
     task = "pointmaze-large-diverse"

@@ -214,14 +214,18 @@ def evaluate(
     )
 
 
-def report(directory: str) -> Report:
+def report(directory: str, task: str | None = None) -> Report:
     """Draw the report of a finished run once more: table, figures, clip.
 
     Args:
         directory: A run of `dds run`.
+        task: File of the run's task, where its environment is in a module of your own.
     """
     from dds_lightning.study.report import report as draw
+    from dds_lightning.tasks import get_task
 
+    if task is not None:
+        get_task(task)  # from now on it is known by its name
     return draw(directory)
 
 

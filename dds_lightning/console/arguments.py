@@ -22,6 +22,17 @@ def takes_lists(annotation: Any) -> bool:
     return text.startswith(("list[", "Sequence[")) and "|" not in text
 
 
+def without_files(arguments: Sequence[str], flag: str = "--config") -> list[str]:
+    """Return the arguments without the files of settings that they name."""
+    rest, out = iter(arguments), []
+    for argument in rest:
+        if argument == flag:
+            next(rest, None)
+        elif not argument.startswith(f"{flag}="):
+            out.append(argument)
+    return out
+
+
 def as_lists(arguments: Sequence[str], options: Collection[str]) -> list[str]:
     """Return the arguments with brackets around every value of `options` that has none."""
     out: list[str] = []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import sys
 import tempfile
 import threading
 import warnings
@@ -41,6 +42,12 @@ def register_environments() -> None:
                 )
 
 
+def find_modules_here() -> None:
+    """Let imports find modules of the current folder, as `python -m` does."""
+    if "" not in sys.path:
+        sys.path.insert(0, "")
+
+
 def build_env(env_id: str | EnvSpec, **kwargs: Any) -> gym.Env[Any, Any]:
     """`gymnasium.make` for any of our environments, safe to call from many processes at once.
 
@@ -53,6 +60,8 @@ def build_env(env_id: str | EnvSpec, **kwargs: Any) -> gym.Env[Any, Any]:
         **kwargs: Passed on to `gymnasium.make`; None values are left out.
     """
     register_environments()
+    if isinstance(env_id, str) and ":" in env_id:
+        find_modules_here()
     kwargs = {key: value for key, value in kwargs.items() if value is not None}
     with _BUILD_LOCK, tempfile.TemporaryDirectory(prefix="dds-env-") as folder, warnings.catch_warnings():
         # The table names versions on purpose: a score belongs to the physics that its data come from.

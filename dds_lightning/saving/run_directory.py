@@ -317,10 +317,14 @@ def _json(value: Any) -> Any:
 
 
 def _put_away(folder: Path, root: Path) -> None:
-    """Move a step's folder to `previous/`, in place of what was there."""
+    """Move a step's folder to `previous/`, in place of what was there, unless only that was finished."""
     if not folder.exists():
         return
     previous = root / PREVIOUS / folder.relative_to(root)
+    states = [read_marker(place).get("state") for place in (previous, folder)]
+    if states[0] == "finished" != states[1]:
+        remove_tree(folder, root)
+        return
     remove_tree(previous, root)
     previous.parent.mkdir(parents=True, exist_ok=True)
     os.replace(folder, previous)

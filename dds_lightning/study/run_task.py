@@ -1,5 +1,6 @@
 """The task of a run directory, which stores the definition of a custom task."""
 
+import contextlib
 from pathlib import Path
 
 import yaml
@@ -7,8 +8,8 @@ import yaml
 from dds_lightning.errors import UserError
 from dds_lightning.saving.files import written_whole
 from dds_lightning.saving.untrusted import read_yaml
-from dds_lightning.tasks import Task, definition, is_own, remember
-from dds_lightning.tasks.own import build_task
+from dds_lightning.tasks import Task, definition, is_own, known_task, remember
+from dds_lightning.tasks.own import OwnCodeError, build_task
 
 TASK_FILE = "task.yaml"
 
@@ -32,4 +33,10 @@ def recall_task(run: Path) -> None:
     kept = read_yaml(path, root=run, verdict="is not valid YAML")
     if not isinstance(kept, dict):
         raise UserError(f"{path} is not a mapping, expected the definition of a task")
-    remember(build_task(kept, str(path), trusted=False))
+    try:
+        remember(build_task(kept, str(path), trusted=False))
+    except OwnCodeError:
+        with contextlib.suppress(UserError):
+            known_task(str(kept.get("name")))  # known because the user named its file, in this process
+            return
+        raise

@@ -25,7 +25,6 @@ import difflib
 import importlib
 import math
 import re
-import sys
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -305,8 +304,9 @@ def _body(task: Task, layout: Mapping[str, Any], where: str) -> Body:
 
 def _from_module(address: str) -> Task:
     module, _, name = address.partition(":")
-    if "" not in sys.path:
-        sys.path.insert(0, "")  # as `python -m` does: a module of the current folder
+    from dds_lightning.envs.build import find_modules_here
+
+    find_modules_here()
     try:
         found = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:

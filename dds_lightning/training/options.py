@@ -28,7 +28,9 @@ SUBCOMMANDS = {
 GENERAL = {
     "config": Parameter("config", inspect.Parameter.empty, None, "File of settings; a packaged one by its short name."),
     "seed_everything": Parameter("seed_everything", bool | int, 0, "Seed of everything random."),
-    "ckpt_path": Parameter("ckpt_path", str | None, None, "Go on from this .ckpt, or look at it."),
+    "ckpt_path": Parameter(
+        "ckpt_path", str | None, None, "Continue the training of this .ckpt, or load it to measure it."
+    ),
     "precision": Parameter(
         "precision",
         Literal["auto"] | None,
@@ -89,7 +91,8 @@ def help_of(name: str, arguments: Sequence[str]) -> str | None:
     if subcommand is None:
         parser.epilog = f"`dds {name} fit --help` lists the settings, `dds {name} fit --help trainer` Lightning's."
         commands = parser.add_argument_group("commands")
-        for command, text in SUBCOMMANDS.items():
+        listed = SUBCOMMANDS if stage.commands is None else {"fit": SUBCOMMANDS["fit"], **stage.commands}
+        for command, text in listed.items():
             commands.add_argument(command, help=text)
         return parser.format_help()
     trainers = arguments[-1] == "trainer"

@@ -9,8 +9,10 @@ from jsonargparse import Namespace
 from lightning.pytorch.plugins.environments import SLURMEnvironment
 
 from dds_lightning.errors import UserError
+from dds_lightning.finetune import read
 from dds_lightning.saving.checkpoint import load_ckpt, stage_of
 from dds_lightning.saving.files import expand
+from dds_lightning.training.stages import Stage
 
 PATHS = (
     *("data.data", "data.skill", "data.relabelled", "data.cache", "model.init_from", "checkpoint.dirpath"),
@@ -25,6 +27,21 @@ def expand_paths(settings: Namespace) -> None:
         value = settings.get(name)
         if isinstance(value, str | Path) and str(value).startswith("~"):
             settings[name] = str(expand(value))
+
+
+def take_shape(stage: Stage, model: Namespace, typed: Namespace) -> None:
+    """Take what shapes the network from the checkpoint that a training starts from; files of settings yield to it.
+
+    Args:
+        stage: The training stage.
+        model: Settings of the module, `init_from` among them; changed in place.
+        typed: Settings on the command line, which do not yield.
+    """
+    cls = stage.module_class()
+    trained = read(cls, model.init_from).hparams
+    for name in cls.SHAPE:
+        if f"model.{name}" not in typed and name not in stage.links:
+            model[name] = trained[name]
 
 
 def named_checkpoint(path: str, settings: Namespace) -> str:

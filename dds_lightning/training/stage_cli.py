@@ -22,11 +22,10 @@ from dds_lightning.callbacks.best import BestCheckpoint
 from dds_lightning.callbacks.convergence import Convergence
 from dds_lightning.callbacks.rolling import RollingCheckpoint
 from dds_lightning.configs import resolve_configs
-from dds_lightning.console.arguments import as_lists, list_options
+from dds_lightning.console.arguments import as_lists, list_options, without_files
 from dds_lightning.console.refusals import as_user_errors, sentence
 from dds_lightning.console.reports import Report, table
 from dds_lightning.errors import UserError, refuse_seed
-from dds_lightning.finetune import read
 from dds_lightning.saving.files import short
 from dds_lightning.saving.untrusted import mapping, parse_yaml
 from dds_lightning.tasks.own import is_address
@@ -39,6 +38,7 @@ from dds_lightning.training.resuming import (
     named_checkpoint,
     refuse_conflicts,
     requeued_checkpoint,
+    take_shape,
 )
 from dds_lightning.training.stages import get_stage
 from dds_lightning.training.threads import HELP, refuse_threads
@@ -144,7 +144,7 @@ class StageCLI(LightningCLI):
                 f"--ckpt_path is missing: `dds {self.stage.name} {self.config.subcommand}` needs a checkpoint"
             )
         elif settings.model.get("init_from") is not None and not self.parse_only:
-            self._take_shape(settings.model)
+            take_shape(self.stage, settings.model, self._chosen(typed=True))
 
     def resume(self, path: str | Path) -> None:
         """Go on from a checkpoint: what shaped its training comes from it, and contradictions are refused.
@@ -176,17 +176,10 @@ class StageCLI(LightningCLI):
             if name.removeprefix("model.") not in self.stage.links and name in settings:
                 settings[name] = value
 
-    def _take_shape(self, model: Namespace) -> None:
-        """Take what shapes the network from the checkpoint to start from, except what the user gave."""
-        cls = self.stage.module_class()
-        trained, chosen = read(cls, model.init_from).hparams, self._chosen()
-        for name in cls.SHAPE:
-            if f"model.{name}" not in chosen and name not in self.stage.links:
-                model[name] = trained[name]
-
-    def _chosen(self) -> Namespace:
-        """Settings that the user gave, on the command line or in a file; no defaults."""
-        given: Namespace = self.parser.parse_args(self.arguments, defaults=False)
+    def _chosen(self, typed: bool = False) -> Namespace:
+        """Settings that the user gave, on the command line or, unless only what was typed counts, in a file."""
+        words = without_files(self.arguments) if typed else self.arguments
+        given: Namespace = self.parser.parse_args(words, defaults=False)
         return given[self.config.subcommand]
 
     # ---------------------------------------------------------------- building

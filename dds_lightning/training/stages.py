@@ -39,6 +39,7 @@ class Stage:
         metrics: Names of everything that its `fit` can log, whatever its settings; empty where nobody has listed them.
         reads: Stages whose checkpoint it needs, and the setting that takes it.
         in_run: Whether `dds run` knows its settings; baselines are trained by `dds STAGE fit` and `dds study` alone.
+        commands: What its help lists beside `fit`, name to one line; None lists Lightning's others.
     """
 
     name: str
@@ -54,6 +55,7 @@ class Stage:
     metrics: tuple[str, ...] = ()
     reads: Mapping[str, str] = field(default_factory=dict)
     in_run: bool = True
+    commands: Mapping[str, str] | None = None
 
     def module_class(self) -> type[StageModule]:
         """Import the module."""
@@ -154,6 +156,7 @@ STAGES: dict[str, Stage] = {
                 online="env_steps episodes return success cells",
             ),
             reads=_SKILL,
+            commands={"compare": "Learn a task over discrete skills, continuous skills and raw actions, and compare."},
         ),
         _baseline("td3bc", "TD3+BC, by d3rlpy.", "d3:TD3BC"),
         _baseline("iql", "IQL over single steps, by d3rlpy.", "d3:IQL"),

@@ -257,7 +257,7 @@ def test_an_agent_whose_decoder_followed_is_fine_tuned_with_its_own_skills(dds, 
 def test_nothing_is_held_out_online(dds, skills, tmp_path):
     checkpoint = fit(dds, "raw", skills, tmp_path, 1)
     answer = dds("online", "validate", *QUIET, f"--data.task={TASK}", "--data.actions=raw", f"--ckpt_path={checkpoint}")
-    assert "an online training has no held-out data: look at the agent with `dds evaluate`" in told(answer.err)
+    assert "online training has no held-out data: measure the agent with `dds evaluate`" in told(answer.err)
 
 
 def test_skills_of_an_agent_without_policy_are_drawn_from_their_prior(skills):

@@ -102,7 +102,7 @@ def test_a_policy_starts_from_another_with_new_rewards(start, of_data):
     ("words", "parts"),
     [
         (["--model.init_from=none.ckpt"], ["model.init_from is none.ckpt", "there is no checkpoint"]),
-        (["--model.init_from={start}/policy/last.ckpt"], ["expected", "skill model"]),
+        (["--model.init_from={start}/policy/last.ckpt"], ["expected", "of stage skill"]),
         (["--model.init_from={start}/skill/last.ckpt", "--model.num_skills=8"], ["num_skills is 8", "num_skills=4"]),
         (["--model.init_from={start}/skill/last.ckpt", "--model.hidden_dim=32"], ["hidden_dim is 32", "with 16"]),
         (["--model.init_from={start}/skill/last.ckpt", "--data.horizon=6"], ["horizon is 6", "--data.horizon=5"]),
