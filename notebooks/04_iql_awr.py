@@ -305,8 +305,8 @@ checks.round(2)
 #    turns V at the start from -33 to -83. A junction is then worth what the average drive makes of it, and an arrow
 #    points to what beats that average, which need not be the way.
 # 2. It leaks through thin walls, because a smooth network cannot represent them. At full size three seeds without these
-#    features reach the goal in 0, 0 and 0 % (README): nearly every episode ends pressed against the wall above cell (5,
-#    2), which is close to the goal as the crow flies.
+#    features reach the goal in 0, 0 and 0 % (`checkpoints/README.md`): nearly every episode ends
+#    pressed against the wall above cell (5, 2), which is close to the goal as the crow flies.
 # 3. With `alpha=0` all weights are 1, and the agent drives as the data do, to anywhere: 10 % of 20 episodes reach the
 #    goal. With `alpha=50` it is 85 %, and `effective_sample_size` is the number: in the last batch the weights count as
 #    much as 12 % of the rows would, and 10 % of them are at their upper bound (`clipped_share`).

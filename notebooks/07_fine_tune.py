@@ -480,8 +480,8 @@ gain.round(0)
 #   skills and after 83 with skills from scratch (the average over the seeds, all of which get there).
 # * **The final result is no better.** In the end all four are equal within the spread of three seeds: older skills do
 #   not lead to a better policy.
-# * **A little of everything is close.** A quarter of the skill training, from scratch, takes 38 seconds: pushing a ball
-#   is quickly learnt. The saving grows with the cost of the skills.
+# * **A short training from scratch comes close.** A quarter of the skill training, from scratch, takes 38 seconds:
+#   pushing a ball is quickly learnt. The saving grows with the cost of the skills.
 #
 # ## What you should see
 

@@ -333,8 +333,8 @@ print(f"without: {lost} steps fewer; {facts['truncated episodes']} episodes were
 # ## And as a Minari data set
 #
 # Written with Minari itself, read without it: no code that a data set names is ever executed. For that reason a data
-# set that names an environment is accepted only if the environment is in the table of `dds tasks`. Write your own
-# robot's data set without one, and give the two spaces:
+# set that names an environment is accepted if the environment is in the table of `dds tasks`, or if you name your
+# robot's task file (`--task robot.yaml`). Without either, write it without an environment, and give the two spaces:
 
 # %%
 os.environ["MINARI_DATASETS_PATH"] = str((RUNS / "minari").resolve())  # Minari wants a whole path

@@ -301,8 +301,8 @@ figure
 # %% [markdown]
 # **The paper's number was measured with D4RL's data in D4RL's physics, ours with data from this project in `Hopper-v4`:
 # they can be shown side by side, but neither confirms or refutes the other.** What the bars do show is the method at
-# work: from data whose mean episode is poor, imitation reaches something in between, and choosing skills recovers what
-# the better half can do.
+# work: from data whose mean episode is poor, imitation falls below that mean, and choosing skills recovers what the
+# better half can do.
 #
 # Our agent's first steps, as a clip:
 

@@ -10,7 +10,7 @@ from datamodules.relabelling import Relabelling
 from dds_lightning.cli.arguments import data_spec
 from dds_lightning.console.reports import Report, pairs, table
 from dds_lightning.errors import UserError
-from dds_lightning.saving.places import refuse_no_folder
+from dds_lightning.saving.places import refuse_no_folder, refuse_unwritable
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -187,8 +187,9 @@ def evaluate(
         checkpoint: Which of a run's checkpoints; both means the last and, where the run kept one, the best.
         seed: Seed of the environments and of sampling.
         workers: Number of processes for the environments; without it one per core.
-        out: Parquet file for the table of episodes.
+        out: Parquet (or .csv) file for the table of episodes.
     """
+    refuse_unwritable(out)
     if directory not in (None, "-") and skill is None and policy is None:
         refuse_no_folder(str(directory))
     from dds_lightning.cli.methods import baseline_at, evaluate_baseline

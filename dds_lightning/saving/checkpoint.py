@@ -233,5 +233,7 @@ def load_module(cls: type[M], path: str | os.PathLike[str], part: str) -> M:
     if path.is_dir() or not path.suffix:
         return load_published(path).module(cls, part)
     checkpoint = load_ckpt(path)
+    if (saved := stage_of(checkpoint)) not in (None, part):
+        raise UserError(f"{path} is a checkpoint of stage {saved}, expected {part}")
     settings = dict(checkpoint.get("hyper_parameters") or {})
     return build_module(cls, settings, checkpoint["state_dict"], str(path))

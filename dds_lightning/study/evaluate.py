@@ -122,7 +122,10 @@ def report_episodes(
     report = Report({**data, "results": summary}, lines)
     if out is not None:
         Path(out).parent.mkdir(parents=True, exist_ok=True)
-        result.episodes.to_parquet(out, index=False)
+        if Path(out).suffix == ".csv":
+            result.episodes.to_csv(out, index=False)
+        else:
+            result.episodes.to_parquet(out, index=False)
         report.data["episodes"] = out
         report.text.append(out)
     return report

@@ -1,6 +1,7 @@
 """Checkpoints that nothing has published, for a goal of one's own: played, published, looked at; and lists of one."""
 
 import json
+from pathlib import Path
 
 import pytest
 
@@ -12,6 +13,7 @@ from dds_lightning.study.loose import loose_agent
 from dds_lightning.tasks import get_task
 from tests.fits import POLICY, QUIET, call, of_data, skill_of, told
 
+CHECKPOINTS = Path(__file__).parents[2] / "checkpoints"
 TASK = "pointmaze-umaze-diverse?goal=1,3"
 
 
@@ -171,3 +173,14 @@ def test_an_agent_is_recorded_in_its_task_and_what_cannot_be_is_refused(trained,
     ):
         assert main(["record", *map(str, words)]) == 2
         assert message in told(capsys.readouterr().err)
+
+
+def test_a_table_that_could_not_be_written_is_refused_before_anybody_plays(tmp_path, capsys):
+    words = ["evaluate", str(CHECKPOINTS / "pointmaze-large"), "--episodes=1", "--workers=0"]
+    (tmp_path / "file").touch()
+    for out, sentence in (
+        (tmp_path, "a folder: give the name"),
+        (tmp_path / "file" / "x", "nothing can be written in"),
+    ):
+        assert main([*words, f"--out={out}"]) == 2
+        assert sentence in " ".join(capsys.readouterr().err.split())

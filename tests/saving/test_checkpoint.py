@@ -171,7 +171,7 @@ def test_a_checkpoint_that_does_not_fit_is_refused(tmp_path):
     wide = lightning_ckpt(tmp_path / "wide.ckpt", small_policy(), hidden_dims=[16])
     with pytest.raises(UserError, match=r"wide\.ckpt does not fit PolicyModule: .* is \(.*\), expected \("):
         load_module(PolicyModule, wide, "policy")
-    with pytest.raises(UserError, match=r"wide\.ckpt does not hold a SkillModule of this version"):
+    with pytest.raises(UserError, match=r"wide\.ckpt is a checkpoint of stage policy, expected skill"):
         SkillModule.load(wide)
     single = lightning_ckpt(tmp_path / "single.ckpt", small_policy(), num_skills=1)
     with pytest.raises(UserError, match=r"single\.ckpt: model\.num_skills is 1"):
