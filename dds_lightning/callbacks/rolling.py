@@ -4,8 +4,11 @@ Lightning's `ModelCheckpoint` does not serve here: it does not save when a signa
 before a validation of the same step, resuming leaves that validation out.
 """
 
+import itertools
 import multiprocessing
+import os
 import time
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -60,8 +63,23 @@ class RollingCheckpoint(Checkpoint):
         if multiprocessing.parent_process() is not None:
             interrupts.catch_in_a_process()
         interrupts.take_back()
+        if trainer.global_step == 0 and trainer.is_global_zero:
+            self._keep_earlier()
         self._saved_time = time.monotonic()
         self._saved_step = trainer.global_step
+
+    def _keep_earlier(self) -> None:
+        """Rename what an earlier training left in this place: a command typed once more must not cost its result."""
+        assert self.path is not None, "setup('fit') comes first"
+        for found in (self.path, self.path.with_name("best.ckpt")):
+            if found.is_file():
+                numbers = itertools.count(1)  # `last-v1.ckpt`, as Lightning's own callback counts
+                kept = next(path for i in numbers if not (path := found.with_stem(f"{found.stem}-v{i}")).exists())
+                os.replace(found, kept)
+                warnings.warn(
+                    f"{found} is an earlier training's, and {kept.name} now; --ckpt_path={kept} goes on from it",
+                    stacklevel=2,
+                )
 
     def on_train_batch_start(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, batch: Any, batch_idx: int

@@ -72,6 +72,17 @@ def test_a_checkpoint_is_written_every_so_many_steps_and_seconds(monkeypatch):
     assert 2 <= len(saved) <= 5
 
 
+def test_the_same_command_again_keeps_what_the_first_one_made():
+    fit([RollingCheckpoint("here"), BestCheckpoint("quality")])
+    first = torch.load("here/last.ckpt", weights_only=True)["state_dict"]
+    with pytest.warns(UserWarning, match="is an earlier training's, and last-v1.ckpt now; --ckpt_path="):
+        fit([RollingCheckpoint("here")], max_steps=3)
+    assert sorted(path.name for path in Path("here").iterdir()) == ["best-v1.ckpt", "last-v1.ckpt", "last.ckpt"]
+    assert (step_of("here/last.ckpt"), step_of("here/last-v1.ckpt")) == (3, 10)
+    kept = torch.load("here/last-v1.ckpt", weights_only=True)["state_dict"]
+    assert all(torch.equal(value, kept[name]) for name, value in first.items())
+
+
 def test_an_error_replaces_no_checkpoint():
     class Fails(pl.Callback):
         def on_train_batch_start(self, trainer, *_):
