@@ -270,7 +270,7 @@ def test_what_fine_tuning_saved_loads_and_resumes_without_the_start(starts, tmp_
     ("name", "settings", "parts"),
     [
         ("none.ckpt", {}, ["model.init_from", "none.ckpt", "there is no checkpoint"]),
-        ("policy.ckpt", {}, ["model.init_from", "policy.ckpt", "skill model"]),
+        ("policy.ckpt", {}, ["model.init_from", "policy.ckpt", "stage skill"]),
         ("skill.ckpt", {"num_skills": 8}, ["model.num_skills is 8", "trained with 4", "--model.num_skills=4"]),
         ("skill.ckpt", {"horizon": 7}, ["model.horizon is 7", "trained with 5", "--data.horizon=5"]),
         ("gaussian.ckpt", {}, ["model.bottleneck is vq", "trained with gaussian"]),

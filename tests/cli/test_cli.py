@@ -315,7 +315,7 @@ def test_a_missing_damaged_or_strange_checkpoint_is_refused(dds, of_data, skill,
     Path("cut.ckpt").write_bytes(skill.read_bytes()[:-2000])
     refused(dds("skill", "test", *of_data, "--ckpt_path=cut.ckpt"), "cut.ckpt")
     words = ["policy", "fit", *of_data, f"--data.skill={skill}", f"--ckpt_path={skill}"]
-    refused(dds(*words), "skill model", "policy")
+    refused(dds(*words), "of stage skill, expected policy")
     assert files() == ["cut.ckpt"]
 
 
