@@ -116,9 +116,16 @@ class Trajectories:
         """
         if not len(episodes):
             raise DataError(f"data set '{name}' is empty: it has no episodes; give at least one")
+        if isinstance(episodes, Mapping):
+            raise DataError(f"data set '{name}' is one mapping, expected a list of them: give [episode]")
         first = episodes[0]
         observation_dim = observation_dim or _width(first.get("observations"))
         action_dim = action_dim or _width(first.get("actions")) or 1
+        for which, bound in (("action_low", action_low), ("action_high", action_high)):
+            if (shape := np.shape(bound)) not in ((), (1,), (action_dim,)):
+                raise DataError(
+                    f"data set '{name}': {which} has shape {shape}, expected one number or {action_dim} of them"
+                )
         low = np.broadcast_to(np.asarray(action_low, np.float32), (action_dim,)).copy()
         high = np.broadcast_to(np.asarray(action_high, np.float32), (action_dim,)).copy()
         check_box(f"data set '{name}'", low, high)

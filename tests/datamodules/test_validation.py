@@ -115,6 +115,13 @@ def test_an_empty_set_is_refused() -> None:
         Trajectories.from_episodes("nothing", [])
 
 
+def test_bounds_of_another_width_and_an_episode_by_itself_are_refused(make_episode: Make) -> None:
+    with pytest.raises(DataError, match=r"action_low has shape \(7,\), expected one number or \d of them"):
+        Trajectories.from_episodes("x", [make_episode(5)], action_low=[-1.0] * 7)
+    with pytest.raises(DataError, match=r"is one mapping, expected a list of them: give \[episode\]"):
+        Trajectories.from_episodes("x", make_episode(5))  # type: ignore[arg-type]
+
+
 def test_rounding_over_the_box_is_clipped_not_refused(make_episode: Make) -> None:
     episode = make_episode(5)
     episode["actions"][0] = 1.000005
