@@ -45,6 +45,24 @@ def refuse_other_data(state: Mapping[str, str], data: Any, trainer: Any) -> None
         )
 
 
+def refuse_other_rounds(trainer: Any) -> None:
+    """Refuse a Trainer of online training whose steps are not those that `data.updates` counts.
+
+    Raises:
+        UserError: It has several processes, which would all collect the same, or adds up several batches.
+    """
+    if trainer.world_size > 1:
+        raise UserError(
+            f"the Trainer has {trainer.world_size} processes, expected 1: online, one process collects for one policy; "
+            "leave out trainer.devices, and raise data.num_envs for more environments side by side"
+        )
+    if trainer.accumulate_grad_batches != 1:
+        raise UserError(
+            f"trainer.accumulate_grad_batches is {trainer.accumulate_grad_batches}, expected 1: data.updates counts "
+            "batches; raise data.batch_size instead"
+        )
+
+
 class TensorLoader:
     """Batches by index, in an order that is a function of (seed, epoch).
 

@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from datamodules.loader import refuse_other_rounds
 from datamodules.relabel import Relabelled
 from datamodules.relabelled import RelabeledDataModule
 from datamodules.relabelling import Relabelling
@@ -173,7 +174,7 @@ class OnlineDataModule(pl.LightningDataModule):
         if stage != "fit":
             raise UserError("online training has no held-out data: measure the agent with `dds evaluate`")
         if self.trainer is not None:
-            _refuse_other_rounds(self.trainer)
+            refuse_other_rounds(self.trainer)
         if self.loader is not None:
             return
         if self._prior_module is not None:
@@ -230,24 +231,6 @@ class OnlineDataModule(pl.LightningDataModule):
         """Close the environments."""
         if self.loader is not None:
             self.loader.collector.close()
-
-
-def _refuse_other_rounds(trainer: pl.Trainer) -> None:
-    """Refuse a Trainer whose steps are not those that `updates` counts.
-
-    Raises:
-        UserError: It has several processes, which would all collect the same, or adds up several batches.
-    """
-    if trainer.world_size > 1:
-        raise UserError(
-            f"the Trainer has {trainer.world_size} processes, expected 1: online, one process collects for one policy; "
-            "leave out trainer.devices, and raise data.num_envs for more environments side by side"
-        )
-    if trainer.accumulate_grad_batches != 1:
-        raise UserError(
-            f"trainer.accumulate_grad_batches is {trainer.accumulate_grad_batches}, expected 1: data.updates counts "
-            "batches; raise data.batch_size instead"
-        )
 
 
 class OnlineLoader:

@@ -202,7 +202,7 @@ Image(told["figure"])
 # The result is an agent like any other: it plays, is published, exported and drawn by the same commands.
 
 # %%
-agent = DDSAgent.load(RUNS / "compare/discrete-skills/0/agent", seed=0)
+agent = DDSAgent.load(RUNS / "compare/discrete-skills/0-played/agent", seed=0)
 played = rollout(task, [Contestant("SAC over skills", agent, 4)], seed=1, workers=1, record=True)
 clip = write_clip(RUNS / "episode.gif", task, played.paths["SAC over skills", 0], title="SAC over skills")
 display(Image(clip))

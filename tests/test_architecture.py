@@ -61,7 +61,7 @@ ROOMS = {
     "datamodules.relabelling datamodules.sources datamodules.trajectories",
     "datamodules.transitions": "envs errors skill datamodules.loader datamodules.relabel datamodules.relabelling "
     "datamodules.segments",
-    "datamodules.online": "errors online skill tasks datamodules.relabel datamodules.relabelled "
+    "datamodules.online": "errors online skill tasks datamodules.loader datamodules.relabel datamodules.relabelled "
     "datamodules.relabelling",
     # training
     "dds_lightning.callbacks": "agent console envs errors module online policy rollout skill tasks",

@@ -16,7 +16,6 @@ import numpy as np
 import pandas as pd
 from rich.console import Console
 
-from datamodules.online import OnlineDataModule
 from dds_lightning.agent import DDSAgent
 from dds_lightning.console.refusals import did_you_mean
 from dds_lightning.console.reports import Report, table
@@ -34,6 +33,7 @@ from dds_lightning.saving.run_directory import Done, RunDirectory, locked
 from dds_lightning.saving.untrusted import read_csv
 from dds_lightning.tasks import facts_to_keep, get_task
 from dds_lightning.training.stage_cli import command, settings_of
+from dds_lightning.training.stages import get_stage
 
 Facts = Mapping[str, Any]
 CURVE = {
@@ -154,7 +154,7 @@ def _refuse_misfits(prepared: Mapping[str, Sequence[str]]) -> None:
     """
     for name, arguments in prepared.items():
         config = settings_of("online", arguments)
-        data = OnlineDataModule(**config["data"])
+        data: Any = get_stage("online").data_class()(**config["data"])
         expected = {"discrete skills": "discrete", "continuous skills": "continuous"}.get(name, data.space)
         if data.space != expected:
             flag, other = ("skill", "gaussian") if expected == "discrete" else ("gaussian", "skill")

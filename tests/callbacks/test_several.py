@@ -134,7 +134,7 @@ def test_loaders_of_ones_own_are_refused(tmp_path):
             rows = [{name: value[i] for name, value in self.rows.items()} for i in range(ROWS)]
             return torch.utils.data.DataLoader(rows, batch_size=8)
 
-    with pytest.raises(UserError, match="come from a DataLoader"):
+    with pytest.raises(UserError, match="come from DataLoader, expected recorded data"):
         train(tmp_path, SeveralUpdates(10), data=Own())
     with pytest.raises(UserError, match="expected at least 2"):
         SeveralUpdates(1)

@@ -86,11 +86,20 @@ def test_a_new_stage_is_published_and_starts_another_training(dds, data, tmp_pat
     assert 0 < change.abs().max() < 1e-8
 
 
-def test_a_new_stage_is_a_step_of_a_run(dds, tmp_path, monkeypatch):
+@pytest.fixture
+def steps():
+    """The steps of a run, in their order again afterwards."""
+    before = dict(STEPS)
+    yield STEPS
+    STEPS.clear()
+    STEPS.update(before)
+
+
+def test_a_new_stage_is_a_step_of_a_run(dds, tmp_path, steps):
     step = training_step("forward", ("data",), lambda run, settings: f"forward: {settings['trainer']['max_steps']}")
-    for name in list(STEPS)[1:]:
-        monkeypatch.delitem(STEPS, name)
-    monkeypatch.setitem(STEPS, "forward", step)
+    for name in list(steps)[1:]:
+        del steps[name]
+    steps["forward"] = step
     words = ["run", TASK, "--out", tmp_path / "run", "--data_steps=2000", "--workers=1", "--json"]
     words += ["--forward.trainer.max_steps=3", "--forward.data.batch_size", 32, "--forward.trainer.accelerator=cpu"]
     words += [
