@@ -52,17 +52,18 @@ ROOMS = {
     "datamodules.listing": "errors tasks datamodules.sources datamodules.storage datamodules.trajectories",
     "datamodules.partial_codes": "errors saving",
     "datamodules.relabelling": "envs errors tasks",
+    "datamodules.robots": "errors saving tasks",
     "datamodules.relabel": "console envs errors saving skill datamodules.partial_codes datamodules.relabelling "
     "datamodules.trajectories",
     "datamodules.segments": "errors nn tasks datamodules.collect datamodules.loader datamodules.sources "
     "datamodules.trajectories",
     "datamodules.relabelled": "errors nn saving skill tasks datamodules.loader datamodules.partial_codes "
     "datamodules.relabel "
-    "datamodules.relabelling datamodules.sources datamodules.trajectories",
+    "datamodules.relabelling datamodules.robots datamodules.sources datamodules.trajectories",
     "datamodules.transitions": "envs errors skill datamodules.loader datamodules.relabel datamodules.relabelling "
     "datamodules.segments",
     "datamodules.online": "errors online skill tasks datamodules.loader datamodules.relabel datamodules.relabelled "
-    "datamodules.relabelling",
+    "datamodules.relabelling datamodules.robots",
     # training
     "dds_lightning.callbacks": "agent console envs errors module online policy rollout skill tasks",
     "dds_lightning.training": "callbacks configs console errors finetune module nn saving tasks",
