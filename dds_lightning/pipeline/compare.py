@@ -5,7 +5,6 @@ Every training is a `dds online fit` in a folder of its own and is done once; a 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -23,15 +22,14 @@ from dds_lightning.errors import UserError
 from dds_lightning.interpret.draw.online import plot_comparison
 from dds_lightning.online.offline import refuse_other_policy
 from dds_lightning.online.parts import checkpoint_parts
+from dds_lightning.pipeline.evaluating import publish_played
 from dds_lightning.policy import PolicyModule
-from dds_lightning.rollout.actors import Contestant
-from dds_lightning.rollout.play import rollout
 from dds_lightning.saving.arrays import read_npy
 from dds_lightning.saving.checkpoint import load_ckpt
 from dds_lightning.saving.files import sha256
 from dds_lightning.saving.run_directory import Done, RunDirectory, locked
 from dds_lightning.saving.untrusted import read_csv
-from dds_lightning.tasks import facts_to_keep, get_task
+from dds_lightning.tasks import get_task
 from dds_lightning.training.stage_cli import command, settings_of
 from dds_lightning.training.stages import get_stage
 
@@ -110,12 +108,12 @@ def compare(asked: Comparison) -> Report:
     task = get_task(asked.task)
     variants = asked.variants()
     prepared = {name: _arguments(asked, more) for name, more in variants.items()}
-    settings = {name: _settings(asked, arguments) for name, arguments in prepared.items()}
-    _refuse_misfits(prepared)
+    configs = {name: settings_of("online", arguments) for name, arguments in prepared.items()}
+    _refuse_misfits(configs)
     with locked(asked.out):
         directory = RunDirectory(asked.out, Console(stderr=True))
         done = {
-            (name, seed): _do(asked, directory, name, seed, prepared[name], settings[name])
+            (name, seed): _do(asked, directory, name, seed, prepared[name], configs[name])
             for name in variants
             for seed in range(asked.seeds)
         }
@@ -146,14 +144,13 @@ def _arguments(asked: Comparison, more: Sequence[str]) -> list[str]:
     return [*arguments, f"--trainer.max_steps={steps}", f"--trainer.log_every_n_steps={often}"]
 
 
-def _refuse_misfits(prepared: Mapping[str, Sequence[str]]) -> None:
-    """Build what each variant would train, without training it.
+def _refuse_misfits(configs: Mapping[str, Facts]) -> None:
+    """Build the data of each variant and look at its policy, without training.
 
     Raises:
         UserError: A file is missing or of another kind, or a policy is one over other skills.
     """
-    for name, arguments in prepared.items():
-        config = settings_of("online", arguments)
+    for name, config in configs.items():
         data: Any = get_stage("online").data_class()(**config["data"])
         expected = {"discrete skills": "discrete", "continuous skills": "continuous"}.get(name, data.space)
         if data.space != expected:
@@ -166,9 +163,8 @@ def _refuse_misfits(prepared: Mapping[str, Sequence[str]]) -> None:
             refuse_other_policy(PolicyModule.load(path), path, data.skill_hash, data.choices)
 
 
-def _settings(asked: Comparison, arguments: Sequence[str]) -> dict[str, Any]:
+def _settings(config: Facts) -> dict[str, Any]:
     """What a training's result depends on: its settings, and what the files hold instead of where they are."""
-    config = settings_of("online", arguments)
     places = {"skill": config["data"]["skill"], "policy": config["model"]["offline"]}
     data = {name: value for name, value in config["data"].items() if name not in ("skill", "cache", "seed")}
     return {
@@ -189,13 +185,13 @@ def _content(path: str | None) -> str | None:
 
 
 def _do(
-    asked: Comparison, directory: RunDirectory, name: str, seed: int, prepared: Sequence[str], settings: Facts
+    asked: Comparison, directory: RunDirectory, name: str, seed: int, prepared: Sequence[str], config: Facts
 ) -> tuple[Done, Done]:
     """One training, and its agent at play; neither is repeated where it was done."""
     place, title = f"{name.replace(', ', '-').replace(' ', '-')}/{seed}", f"{name}, seed {seed}"
-    trained = directory.do(place, title, settings, [], partial(_train, seed, prepared))
+    trained = directory.do(place, title, _settings(config), [], partial(_train, seed, prepared))
     play = {"episodes": asked.episodes, "seed": seed}
-    work = partial(_play, asked, name, seed, trained)
+    work = partial(_play, asked, name, seed, config["data"], trained)
     return trained, directory.do(f"{place}-played", f"{title}, at play", play, [trained], work)
 
 
@@ -217,15 +213,14 @@ def _train(seed: int, prepared: Sequence[str], folder: Path, resuming: bool) -> 
     return {"curve": folder / "curve.csv", "visits": folder / "visits.npy", "checkpoint": last, "collected": collected}
 
 
-def _play(asked: Comparison, name: str, seed: int, trained: Done, folder: Path, resuming: bool) -> Mapping[str, Any]:
+def _play(
+    asked: Comparison, name: str, seed: int, data: Facts, trained: Done, folder: Path, resuming: bool
+) -> Mapping[str, Any]:
     """How the agent of a training plays, and the agent published with it."""
-    task = get_task(asked.task)
-    skill = None if name == "raw actions" else asked.gaussian if name == "continuous skills" else asked.skill
+    skill = None if data["actions"] == "raw" else data["skill"]
     agent = DDSAgent(*checkpoint_parts(skill, str(trained.outputs["checkpoint"])), seed=seed)
-    result = rollout(task, [Contestant(name, agent, asked.episodes)], seed=seed, workers=asked.workers)
-    (played,) = json.loads(result.summary().to_json(orient="records"))
-    metrics = {"episodes": asked.episodes, "seed": seed, "results": [played]}
-    return {"agent": agent.save(folder / "agent", metrics=metrics, **facts_to_keep(task)), "played": played}
+    task = get_task(asked.task)
+    return publish_played(agent, name, task, folder / "agent", asked.episodes, seed, asked.workers)
 
 
 def _table(variants: Mapping[str, Any], seeds: int, done: Mapping[tuple[str, int], tuple[Done, Done]]) -> pd.DataFrame:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from dds_lightning.pipeline.context import Run, Settings
 from dds_lightning.study import contestants, protocol
-from dds_lightning.tasks import facts_to_keep
+from dds_lightning.tasks import Task, facts_to_keep
 
 if TYPE_CHECKING:
     from dds_lightning.agent import DDSAgent
@@ -52,15 +52,29 @@ def play_baselines(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
     return {"episodes": folder / "episodes.parquet"}
 
 
-def publish_played(run: Run, agent: DDSAgent, name: str, place: Path) -> Mapping[str, Any]:
-    """Let an agent play that was trained after the report, and publish it with what it reached."""
+def publish_played(
+    agent: DDSAgent, name: str, task: Task, place: Path, episodes: int, seed: int, workers: int | None
+) -> Mapping[str, Any]:
+    """Let an agent play by itself, and publish it with what it reached.
+
+    Args:
+        agent: Who plays.
+        name: What a table calls it.
+        task: What it plays.
+        place: Folder to publish it in.
+        episodes: Number of episodes.
+        seed: Of the episodes.
+        workers: Processes for the environments; None takes one per core.
+
+    Returns:
+        ``agent``, the published folder, and ``played``, the row of the table.
+    """
     from dds_lightning.rollout.actors import Contestant
     from dds_lightning.rollout.play import rollout
 
-    wanted, task = run.wanted, run.task
-    result = rollout(task, [Contestant(name, agent, run.episodes)], seed=wanted.seed, workers=wanted.workers)
+    result = rollout(task, [Contestant(name, agent, episodes)], seed=seed, workers=workers)
     (played,) = json.loads(result.summary().to_json(orient="records"))
-    metrics = {"episodes": run.episodes, "seed": wanted.seed, "results": [played]}
+    metrics = {"episodes": episodes, "seed": seed, "results": [played]}
     return {"agent": agent.save(place, metrics=metrics, **facts_to_keep(task)), "played": played}
 
 

@@ -121,7 +121,7 @@ def _report(run: Run, clock: float) -> Report:
         text.append(f"agent: {run.output('evaluate', 'agent')}")
     if "online" in run.done and (played := run.facts("online").get("played")):
         data["online"] = played
-        text.append(f"after learning online: score {played['score']:.1f} over {played['episodes']} episodes, greedy")
+        text.append(f"after learning online: score {played['score']:.1f} over {played['episodes']} episodes, sampled")
     text += [f"{name}: {path}" for step in shown for name, path in step.outputs.items()]
     total = duration(sum(step.seconds for step in run.done.values()))
     text.append(f"{total} in all, {duration(clock)} by the clock in this call; everything is in {run.out}")

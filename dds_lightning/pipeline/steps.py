@@ -144,8 +144,9 @@ def _fit(stage: str, best: str, publish: bool, run: Run, folder: Path, resuming:
         from dds_lightning.online.parts import checkpoint_parts
         from dds_lightning.pipeline.evaluating import publish_played
 
-        agent = DDSAgent(*checkpoint_parts(str(skill), str(made["checkpoint"])), seed=run.wanted.seed)
-        made |= publish_played(run, agent, stage, folder / "agent")
+        seed, workers = run.wanted.seed, run.wanted.workers
+        agent = DDSAgent(*checkpoint_parts(str(skill), str(made["checkpoint"])), seed=seed)
+        made |= publish_played(agent, stage, run.task, folder / "agent", run.episodes, seed, workers)
     return made
 
 
