@@ -15,13 +15,15 @@ from torch import Tensor, nn
 
 from dds_lightning.errors import UserError
 from dds_lightning.finetune import read, refuse_other_box, start_from
-from dds_lightning.nn.normaliser import ActionBox, Normaliser
+from dds_lightning.nn.embedding import EmbeddingMixin
+from dds_lightning.nn.normaliser import ActionBox
+from dds_lightning.nn.ranges import Rule, network_rules
 from dds_lightning.saving.checkpoint import STAGE_KEY, load_module
 
 Schedule = Literal["constant", "cosine"]
 
 
-class StageModule(pl.LightningModule):
+class StageModule(EmbeddingMixin, pl.LightningModule):
     """A training stage's module: checked settings, a start from weights, Adam by part.
 
     A subclass calls `save_hyperparameters(ignore=["init_from"])`, builds itself (its observations go through
@@ -41,14 +43,13 @@ class StageModule(pl.LightningModule):
     OF_DATA: ClassVar[tuple[str, ...]] = ()
     """Buffers that always come from the data."""
 
-    normaliser: Normaliser
     action_box: ActionBox  # of modules that see actions
     init_from: str | None = None  # the checkpoint this module started from, in this process
     _held: Mapping[str, Sequence[nn.Parameter]] = MappingProxyType({})  # submodules that stand still, and their weights
     learning: tuple[str, ...] = ()  # what `learning_at` said of the present step
     terms: Mapping[str, Tensor] = MappingProxyType({})  # of the last training step; `FiniteGuard` names the bad ones
 
-    def _refuse(self, rules: Sequence[tuple[str, bool, str]]) -> None:
+    def _refuse(self, rules: Sequence[Rule]) -> None:
         """Refuse settings outside their range; `rules` are (name, whether the value is allowed, what is expected).
 
         The rules that all stages share come after those.
@@ -70,7 +71,7 @@ class StageModule(pl.LightningModule):
         if parts:
             left = ", ".join(self.trained_parts)
             common.append(("lr_scale", set(scales) <= set(self.trained_parts), f"factors for what is trained: {left}"))
-        for name, fine, expected in [*rules, *common]:
+        for name, fine, expected in [*rules, *network_rules(h), *common]:
             if not fine:
                 raise UserError(f"model.{name} is {h[name]}, expected {expected}")
 

@@ -24,13 +24,13 @@ from collections.abc import Sequence
 from typing import ClassVar, Literal, NamedTuple, get_args
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 import dds_lightning.losses as losses
 from dds_lightning.module import StageModule
 from dds_lightning.nn.draws import categorical
-from dds_lightning.nn.mlp import MLP, FourierFeatures
-from dds_lightning.nn.normaliser import Normaliser
+from dds_lightning.nn.embedding import FOURIER
+from dds_lightning.nn.mlp import MLP
 from dds_lightning.nn.watch import complaints
 
 Selection = Literal["sample", "greedy", "argmax_q"]
@@ -101,7 +101,7 @@ class PolicyModule(StageModule):
     STAGE = "policy"
     PARTS: ClassVar = {"critic": ("value", "critic", "target_critic"), "actor": ("actor",)}
     # `awr` belongs to the weights: with `closed_form` the actor is beta.
-    SHAPE = ("num_skills", "hidden_dims", "layer_norm", "fourier_features", "fourier_scale", "fourier_seen", "awr")
+    SHAPE = ("num_skills", "hidden_dims", "layer_norm", "awr", *FOURIER)
     OF_DATA = ("support_mask", "value_range", "advantage_spread")
     support_mask: Tensor
     value_range: Tensor
@@ -143,7 +143,6 @@ class PolicyModule(StageModule):
         self.save_hyperparameters(ignore=["init_from"])
         rules = [
             ("num_skills", num_skills >= 2, "at least 2: with one code there is nothing to choose"),
-            ("fourier_seen", 0 <= fourier_seen <= observation_dim, f"in [0, {observation_dim}]"),
             ("tau", 0 < tau < 1, "in (0, 1)"),
             ("alpha", alpha >= 0, "0 or more"),
             ("alpha_unit", alpha_unit in get_args(Unit), " or ".join(get_args(Unit))),
@@ -151,18 +150,12 @@ class PolicyModule(StageModule):
             ("awr", awr in get_args(Solution), " or ".join(get_args(Solution))),
             ("beta_floor", 0 <= beta_floor < 1 / num_skills, f"in [0, 1/{num_skills})"),
             ("beta_ratio", 0 <= beta_ratio <= 1, "in [0, 1]"),
-            ("dropout", 0 <= dropout < 1, "in [0, 1)"),
             ("target_ema", 0 < target_ema <= 1, "in (0, 1]"),
             ("support", 0 <= support < 1 / num_skills, f"in [0, 1/{num_skills})"),
         ]
         self._refuse(rules)
         self.num_skills = num_skills
-        self.normaliser = Normaliser(observation_dim)
-        self.features: nn.Module = nn.Identity()
-        width = observation_dim
-        if fourier_features:
-            self.features = FourierFeatures(observation_dim, fourier_features, fourier_scale, fourier_seen)
-            width = self.features.output_dim
+        width = self._make_embedding(self.hparams)
         self.value = MLP(width, 1, hidden_dims, layer_norm)
         self.critic = MLP(width, num_skills, hidden_dims, layer_norm, members=2)
         self.target_critic = MLP(width, num_skills, hidden_dims, layer_norm, members=2)
@@ -174,10 +167,6 @@ class PolicyModule(StageModule):
         if alpha_unit == "spread":
             self.register_buffer("advantage_spread", torch.ones(()))  # a running mean over training batches
         self._begin(init_from)
-
-    def embed(self, observations: Tensor) -> Tensor:
-        """Normalise observations (B, O) and append Fourier features."""
-        return self.features(self.normaliser(observations))
 
     def v(self, observations: Tensor) -> Tensor:
         """V(s): (B, O) to (B,)."""

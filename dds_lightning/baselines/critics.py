@@ -31,7 +31,7 @@ class TwinCritic(nn.Module):
     """Two Q networks over state and choice, and their slowly moving targets.
 
     Args:
-        state_dim: Width O of a normalised observation.
+        state_dim: Width F of an embedded observation.
         choice_dim: Width C of an action in [-1, 1] or a skill.
         hidden_dims: Widths of the hidden layers.
     """
@@ -41,7 +41,7 @@ class TwinCritic(nn.Module):
         self.online, self.target = with_target(lambda: MLP(state_dim + choice_dim, 1, hidden_dims, members=2))
 
     def both(self, states: Tensor, choices: Tensor) -> Tensor:
-        """Values (2, B) of choices (B, C) in states (B, O)."""
+        """Values (2, B) of choices (B, C) in embedded states (B, F)."""
         return self.online(_pair(states, choices)).squeeze(-1)
 
     def targets(self, states: Tensor, choices: Tensor) -> Tensor:
@@ -75,9 +75,9 @@ def implicit(
 
     Args:
         critic: Q.
-        value: V, (B, O) to (B, 1).
-        x: (B, O) normalised states.
-        after: (B, O) normalised next states.
+        value: V, (B, F) to (B, 1).
+        x: (B, F) embedded states.
+        after: (B, F) embedded next states.
         batch: Rewards, discounts and dones, (B,) each.
         chosen: (B, C) the data's choices.
         tau: Expectile.
@@ -102,7 +102,7 @@ def draw(
     """Draw `count` choices in each state from a diffusion model without skills.
 
     Returns:
-        The states, (B count, O), each repeated, and the choices, (B count, C).
+        The states, (B count, F), each repeated, and the choices, (B count, C).
     """
     wide = states.repeat_interleave(count, dim=0)
     return wide, decoder.sample(wide, wide[:, :0], generator=generator)

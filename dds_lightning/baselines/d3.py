@@ -20,7 +20,8 @@ from torch import Tensor, nn
 
 from dds_lightning.errors import lacks_extra
 from dds_lightning.module import StageModule
-from dds_lightning.nn.normaliser import ActionBox, Normaliser
+from dds_lightning.nn.embedding import FOURIER
+from dds_lightning.nn.normaliser import ActionBox
 
 GAMMA = 0.99
 """d3rlpy takes a power of one discount; batches say theirs."""
@@ -81,11 +82,11 @@ class D3Module(StageModule):
         """Make the algorithm from its configuration, and our units around it."""
         self._refuse(rules)
         h = self.hparams
-        self.normaliser = Normaliser(h.observation_dim)
+        width = self._make_embedding(h)
         self.action_box = ActionBox(h.action_dim)
         device = "meta" if torch.get_default_device().type == "meta" else "cpu:0"
         self.algorithm = getattr(library().algos, self.CONFIG)(gamma=GAMMA, **config).create(device)
-        self.algorithm.create_impl((h.observation_dim,), h.action_dim)
+        self.algorithm.create_impl((width,), h.action_dim)
         parts = vars(self.algorithm.impl.modules)
         self.networks = nn.ModuleDict({name: part for name, part in parts.items() if isinstance(part, nn.Module)})
         self._optimisers = {name: part for name, part in parts.items() if hasattr(part, "optim")}
@@ -96,10 +97,10 @@ class D3Module(StageModule):
         ones = torch.ones_like(batch["rewards"])[:, None]
         actions = self.action_box.to_unit(batch["actions"])
         return library().torch_utility.TorchMiniBatch(
-            observations=self.normaliser(batch["observations"]),
+            observations=self.embed(batch["observations"]),
             actions=actions,
             rewards=batch["rewards"][:, None],
-            next_observations=self.normaliser(batch["next_observations"]),
+            next_observations=self.embed(batch["next_observations"]),
             next_actions=torch.zeros_like(actions),  # none of the algorithms here asks for these two
             returns_to_go=torch.zeros_like(ones),
             terminals=batch["dones"][:, None],
@@ -136,7 +137,7 @@ class D3Module(StageModule):
 
     def unit_actions(self, observations: Tensor) -> Tensor:
         """The best actions (B, A) in [-1, 1] for observations (B, O)."""
-        actions: Tensor = self.algorithm.impl.predict_best_action(self.normaliser(observations))
+        actions: Tensor = self.algorithm.impl.predict_best_action(self.embed(observations))
         return actions
 
     def act(self, observations: Tensor, generator: torch.Generator | None = None) -> Tensor:
@@ -148,7 +149,7 @@ class D3Module(StageModule):
         return self.act(batch["observations"])
 
     def save_d3(self, path: str | Path) -> None:
-        """Write the algorithm as `d3rlpy.load_learnable` reads it; it takes normalised observations."""
+        """Write the algorithm as `d3rlpy.load_learnable` reads it; it takes what `embed` makes of observations."""
         self.algorithm.save(str(path))
 
 
@@ -166,12 +167,15 @@ class TD3BC(D3Module):
         alpha: Weight of Q beside imitation.
         target_ema: Rate of the targets.
         lr: Learning rate of actor and critic.
+        fourier_features: Frequencies that all networks see beside the observation; 0 for none. Ours takes 64 in mazes.
+        fourier_scale: Standard deviation of those frequencies.
+        fourier_seen: How many leading numbers of the observation they see; 0 for all.
         init_from: ``.ckpt`` or published directory with the initial weights (`dds_lightning.finetune`).
         refit_normaliser: With ``init_from``, take the statistics of the new data, not the checkpoint's.
     """
 
     STAGE, CONFIG = "td3bc", "TD3PlusBCConfig"
-    SHAPE = ("hidden_dims",)
+    SHAPE = ("hidden_dims", *FOURIER)
 
     def __init__(
         self,
@@ -181,6 +185,9 @@ class TD3BC(D3Module):
         alpha: float = 2.5,
         target_ema: float = 0.005,
         lr: float = 3e-4,
+        fourier_features: int = 0,
+        fourier_scale: float = 1.0,
+        fourier_seen: int = 0,
         init_from: str | None = None,
         refit_normaliser: bool = False,
     ) -> None:
@@ -207,12 +214,15 @@ class IQL(D3Module):
         weight_clip: Upper bound of the regression's weights.
         target_ema: Rate of the target critic.
         lr: Learning rate of all networks.
+        fourier_features: Frequencies that all networks see beside the observation; 0 for none. Ours takes 64 in mazes.
+        fourier_scale: Standard deviation of those frequencies.
+        fourier_seen: How many leading numbers of the observation they see; 0 for all.
         init_from: ``.ckpt`` or published directory with the initial weights (`dds_lightning.finetune`).
         refit_normaliser: With ``init_from``, take the statistics of the new data, not the checkpoint's.
     """
 
     STAGE, CONFIG = "iql", "IQLConfig"
-    SHAPE = ("hidden_dims",)
+    SHAPE = ("hidden_dims", *FOURIER)
 
     def __init__(
         self,
@@ -224,6 +234,9 @@ class IQL(D3Module):
         weight_clip: float = 100.0,
         target_ema: float = 0.005,
         lr: float = 3e-4,
+        fourier_features: int = 0,
+        fourier_scale: float = 1.0,
+        fourier_seen: int = 0,
         init_from: str | None = None,
         refit_normaliser: bool = False,
     ) -> None:
@@ -251,12 +264,15 @@ class CQL(D3Module):
         target_ema: Rate of the target critic.
         lr: Learning rate of the critic.
         actor_lr: Learning rate of the actor and of its entropy's temperature.
+        fourier_features: Frequencies that all networks see beside the observation; 0 for none. Ours takes 64 in mazes.
+        fourier_scale: Standard deviation of those frequencies.
+        fourier_seen: How many leading numbers of the observation they see; 0 for all.
         init_from: ``.ckpt`` or published directory with the initial weights (`dds_lightning.finetune`).
         refit_normaliser: With ``init_from``, take the statistics of the new data, not the checkpoint's.
     """
 
     STAGE, CONFIG = "cql", "CQLConfig"
-    SHAPE = ("hidden_dims",)
+    SHAPE = ("hidden_dims", *FOURIER)
 
     def __init__(
         self,
@@ -268,6 +284,9 @@ class CQL(D3Module):
         target_ema: float = 0.005,
         lr: float = 3e-4,
         actor_lr: float = 1e-4,
+        fourier_features: int = 0,
+        fourier_scale: float = 1.0,
+        fourier_seen: int = 0,
         init_from: str | None = None,
         refit_normaliser: bool = False,
     ) -> None:

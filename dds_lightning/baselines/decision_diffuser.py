@@ -132,8 +132,6 @@ class DecisionDiffuser(StageModule):
         self.save_hyperparameters(ignore=["init_from"])
         rules = [
             ("horizon", horizon >= 2, "at least 2: the present state and the next"),
-            ("blocks", blocks >= 1, "at least 1"),
-            ("diffusion_steps", diffusion_steps >= 1, "at least 1"),
             ("untold", 0 <= untold < 1, "in [0, 1)"),
             ("noise_scale", noise_scale >= 0, "0 or more"),
         ]
@@ -158,10 +156,11 @@ class DecisionDiffuser(StageModule):
         fitted = bool(self.normaliser.fitted)
         self.fit_units()
         if not fitted or self.init_from is not None:
-            self.return_range.copy_(self.data_statistics(["return_range"], "use a SequenceDataModule")["return_range"])
+            found = self.data_statistics(["return_to_go_range"], "use a SequenceDataModule")
+            self.return_range.copy_(found["return_to_go_range"])
 
     def scaled(self, returns: Tensor) -> Tensor:
-        """Returns to go in [0, 1], where 1 is that of the best episode."""
+        """Returns to go in [0, 1], where 1 is the greatest of any step of the data."""
         low, high = self.return_range
         return (returns - low) / (high - low).clamp_min(1e-6)
 

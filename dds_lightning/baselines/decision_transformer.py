@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from dds_lightning.baselines.d3 import Batch, D3Module, library
+from dds_lightning.nn.embedding import FOURIER
 from dds_lightning.rollout.actors import Acted
 
 
@@ -38,12 +39,15 @@ class DecisionTransformer(D3Module):
         clip_grad_norm: Greatest norm of the gradient.
         warmup_steps: Steps of linear warm-up.
         lr: Learning rate.
+        fourier_features: Frequencies that all networks see beside the observation; 0 for none. Ours takes 64 in mazes.
+        fourier_scale: Standard deviation of those frequencies.
+        fourier_seen: How many leading numbers of the observation they see; 0 for all.
         init_from: ``.ckpt`` or published directory with the initial weights (`dds_lightning.finetune`).
         refit_normaliser: With ``init_from``, take the statistics of the new data, not the checkpoint's.
     """
 
     STAGE, CONFIG = "dt", "DecisionTransformerConfig"
-    SHAPE = ("horizon", "hidden_dim", "layers", "max_steps")
+    SHAPE = ("horizon", "hidden_dim", "layers", "max_steps", *FOURIER)
     OF_DATA = ("return_range", "reward_affine")
     return_range: Tensor
     reward_affine: Tensor
@@ -63,6 +67,9 @@ class DecisionTransformer(D3Module):
         clip_grad_norm: float = 0.25,
         warmup_steps: int = 10_000,
         lr: float = 1e-4,
+        fourier_features: int = 0,
+        fourier_scale: float = 1.0,
+        fourier_seen: int = 0,
         init_from: str | None = None,
         refit_normaliser: bool = False,
     ) -> None:
@@ -73,7 +80,6 @@ class DecisionTransformer(D3Module):
         rules = [
             ("horizon", horizon >= 1, "at least 1"),
             ("heads", heads >= 1 and hidden_dim % heads == 0, f"a divisor of hidden_dim={hidden_dim}"),
-            ("dropout", 0 <= dropout < 1, "in [0, 1)"),
             ("max_steps", max_steps >= 1, "at least 1"),
             ("warmup_steps", warmup_steps >= 1, "at least 1"),
         ]
@@ -114,7 +120,7 @@ class DecisionTransformer(D3Module):
         """Our sequences as d3rlpy's, in units of the network."""
         rewards = batch["rewards"][..., None]
         return library().torch_utility.TorchTrajectoryMiniBatch(
-            observations=self.normaliser(batch["observations"]),
+            observations=self.embed(batch["observations"]),
             actions=self.action_box.to_unit(batch["actions"]),
             rewards=rewards,
             returns_to_go=(batch["returns"] / self.unit)[..., None],
@@ -138,7 +144,7 @@ class DecisionTransformer(D3Module):
 
     @torch.no_grad()
     def follow(self, states: Tensor, actions: Tensor, returns: Tensor, steps: Tensor, mask: Tensor) -> Tensor:
-        """Unit actions (B, L, A) from normalised states (B, L, O), unit actions, returns, steps and mask (B, L)."""
+        """Unit actions (B, L, A) from embedded states (B, L, O), unit actions, returns, steps and mask (B, L)."""
         network: Any = self.networks["transformer"]
         out: Tensor = network(states, actions, (returns / self.unit)[..., None], self.counted(steps), 1.0 - mask)
         return out
@@ -149,7 +155,7 @@ class DecisionTransformer(D3Module):
         self.log(f"{stage}/action_mse", error, batch_size=len(batch["actions"]), sync_dist=True)
 
     def _taken(self, batch: Batch) -> Tensor:
-        states, actions = self.normaliser(batch["observations"]), self.action_box.to_unit(batch["actions"])
+        states, actions = self.embed(batch["observations"]), self.action_box.to_unit(batch["actions"])
         return self.follow(states, actions, batch["returns"], batch["steps"], torch.ones_like(batch["returns"]))
 
     def predict_step(self, batch: Batch, batch_idx: int) -> Tensor:
@@ -173,7 +179,7 @@ class TransformerActor:
         h, length = self.module.hparams, self.module.hparams.horizon
         low, high = self.module.return_range.cpu()
         self._wanted = float(low + h.target * (high - low))
-        self._states = torch.zeros(num_envs, length, h.observation_dim)
+        self._states = torch.zeros(num_envs, length, self.module.embedding_dim)
         self._actions = torch.zeros(num_envs, length, h.action_dim)
         self._returns, self._mask = torch.zeros(num_envs, length), torch.zeros(num_envs, length)
         self._steps = torch.zeros(num_envs, length, dtype=torch.long)
@@ -186,7 +192,7 @@ class TransformerActor:
         module, live = self.module, torch.from_numpy(rows)
         began = live[torch.from_numpy(np.asarray(restarted))]
         self._mask[began], self._rest[began], self._clock[began] = 0.0, self._wanted, 0
-        x = module.normaliser(torch.from_numpy(np.ascontiguousarray(observations, np.float32)).to(module.device))
+        x = module.embed(torch.from_numpy(np.ascontiguousarray(observations, np.float32)).to(module.device))
         now: Sequence[tuple[Tensor, Tensor | float]] = (
             (self._states, x.cpu()),
             (self._actions, torch.zeros(len(live), self._actions.shape[-1])),

@@ -6,7 +6,8 @@
 ```
 
 As in the authors' code, one of the two Q climbs, drawn by a fair coin, and the other gives the scale of the gradient.
-They update Q first, then pi with the new Q; here one Adam takes both steps at once.
+They update Q first, then pi with the new Q; here one Adam takes both steps at once. They also clip gradients, each
+network's by a norm of its own (1 to 10 on D4RL); `--trainer.gradient_clip_val` clips the norm of both together.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ import dds_lightning.losses as losses
 from dds_lightning.baselines.critics import Batch, CriticModule, Loss, TwinCritic, draw, proposals, take, with_target
 from dds_lightning.nn.diffusion import DiffusionDecoder
 from dds_lightning.nn.draws import categorical
-from dds_lightning.nn.normaliser import ActionBox, Normaliser
+from dds_lightning.nn.embedding import FOURIER
+from dds_lightning.nn.normaliser import ActionBox
 
 
 class DiffusionQL(CriticModule):
@@ -33,7 +35,7 @@ class DiffusionQL(CriticModule):
         observation_dim: O, linked from the data on the command line.
         action_dim: A, linked from the data.
         hidden_dims: Widths of Q.
-        eta: Weight of the Q term; the authors take 1 for locomotion, 0.005 for kitchen, 0.5 to 3.5 for AntMaze.
+        eta: Weight of the Q term; the authors take 1 for locomotion, 0.005 for kitchen, 0.5 to 4.5 for AntMaze.
         backup_samples: Actions of the target policy in the target; with more than 1 the greatest target value counts
             (the authors take 10 on AntMaze).
         samples: Actions proposed when acting, one of which is drawn by the softmax of the target Q.
@@ -46,6 +48,9 @@ class DiffusionQL(CriticModule):
         actor_ema_start: Step before which it does not move.
         lr: Adam's learning rate.
         lr_schedule: ``constant``, or ``cosine`` decay to zero at ``max_steps``.
+        fourier_features: Frequencies that all networks see beside the observation; 0 for none. Ours takes 64 in mazes.
+        fourier_scale: Standard deviation of those frequencies.
+        fourier_seen: How many leading numbers of the observation they see; 0 for all.
         init_from: ``.ckpt`` or published directory with the initial weights (`dds_lightning.finetune`).
         refit_normaliser: With ``init_from``, take the statistics of the new data, not the checkpoint's.
 
@@ -55,7 +60,7 @@ class DiffusionQL(CriticModule):
 
     STAGE = "dql"
     PARTS: ClassVar = {"critic": ("critic",), "actor": ("actor", "target_actor")}
-    SHAPE = ("hidden_dims", "hidden_dim", "blocks", "diffusion_steps")
+    SHAPE = ("hidden_dims", "hidden_dim", "blocks", "diffusion_steps", *FOURIER)
     PREDICTION = "action"
 
     def __init__(
@@ -75,6 +80,9 @@ class DiffusionQL(CriticModule):
         actor_ema_start: int = 1000,
         lr: float = 3e-4,
         lr_schedule: Literal["constant", "cosine"] = "constant",
+        fourier_features: int = 0,
+        fourier_scale: float = 1.0,
+        fourier_seen: int = 0,
         init_from: str | None = None,
         refit_normaliser: bool = False,
     ) -> None:
@@ -85,21 +93,20 @@ class DiffusionQL(CriticModule):
             ("eta", eta >= 0, "0 or more"),
             ("backup_samples", backup_samples >= 1, "at least 1"),
             ("samples", samples >= 1, "at least 1"),
-            ("diffusion_steps", diffusion_steps >= 1, "at least 1"),
             ("target_ema", 0 < target_ema <= 1, "in (0, 1]"),
             ("actor_ema_every", actor_ema_every >= 1, "at least 1"),
         ]
         self._refuse(rules)
-        self.normaliser = Normaliser(observation_dim)
+        width = self._make_embedding(self.hparams)
         self.action_box = ActionBox(action_dim)
-        self.critic = TwinCritic(observation_dim, action_dim, hidden_dims)
-        shape = (observation_dim, action_dim, 0, hidden_dim, blocks, dropout, diffusion_steps)
+        self.critic = TwinCritic(width, action_dim, hidden_dims)
+        shape = (width, action_dim, 0, hidden_dim, blocks, dropout, diffusion_steps)
         self.actor, self.target_actor = with_target(lambda: DiffusionDecoder(*shape))
         self._begin(init_from)
 
     def loss(self, batch: Batch) -> Loss:
         """Equations 3 to 5, summed; what climbs Q leaves Q as it is."""
-        x, chosen = self.normaliser(batch["observations"]), self.action_box.to_unit(batch["actions"])
+        x, chosen = self.embed(batch["observations"]), self.action_box.to_unit(batch["actions"])
         new = draw(self.actor, x, 1)[1]
         values = self.critic.judge(x, new)  # (2, B)
         terms = {
@@ -112,7 +119,7 @@ class DiffusionQL(CriticModule):
     @torch.no_grad()
     def _target(self, batch: Batch) -> Tensor:
         count = self.hparams.backup_samples
-        wide, actions = draw(self.target_actor, self.normaliser(batch["next_observations"]), count)
+        wide, actions = draw(self.target_actor, self.embed(batch["next_observations"]), count)
         after = self.critic.targets(wide, actions).view(2, -1, count).amax(dim=-1).amin(dim=0)
         return losses.td_target(batch["rewards"], batch["discounts"], batch["dones"], after)
 
@@ -126,7 +133,7 @@ class DiffusionQL(CriticModule):
 
     def act(self, observations: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Actions (B, A) for observations (B, O)."""
-        x = self.normaliser(observations)
+        x = self.embed(observations)
         proposed, q = proposals(self.actor, self.critic, x, self.hparams.samples, generator)
         index = categorical(q.softmax(dim=-1), generator)
         return self.action_box.from_unit(take(proposed, index))

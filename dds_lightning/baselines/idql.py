@@ -30,8 +30,9 @@ from dds_lightning.baselines.critics import (
 )
 from dds_lightning.nn.diffusion import DiffusionDecoder
 from dds_lightning.nn.draws import categorical
+from dds_lightning.nn.embedding import FOURIER
 from dds_lightning.nn.mlp import MLP
-from dds_lightning.nn.normaliser import ActionBox, Normaliser
+from dds_lightning.nn.normaliser import ActionBox
 
 
 class IDQL(CriticModule):
@@ -54,6 +55,9 @@ class IDQL(CriticModule):
         actor_ema: Rate of the diffusion model that acts.
         lr: Adam's learning rate.
         lr_schedule: ``constant``, or ``cosine`` decay to zero at ``max_steps``.
+        fourier_features: Frequencies that all networks see beside the observation; 0 for none. Ours takes 64 in mazes.
+        fourier_scale: Standard deviation of those frequencies.
+        fourier_seen: How many leading numbers of the observation they see; 0 for all.
         init_from: ``.ckpt`` or published directory with the initial weights (`dds_lightning.finetune`).
         refit_normaliser: With ``init_from``, take the statistics of the new data, not the checkpoint's.
 
@@ -63,7 +67,7 @@ class IDQL(CriticModule):
 
     STAGE = "idql"
     PARTS: ClassVar = {"critic": ("value", "critic"), "actor": ("actor", "target_actor")}
-    SHAPE = ("hidden_dims", "hidden_dim", "blocks", "diffusion_steps")
+    SHAPE = ("hidden_dims", "hidden_dim", "blocks", "diffusion_steps", *FOURIER)
     PREDICTION = "action"
 
     def __init__(
@@ -82,6 +86,9 @@ class IDQL(CriticModule):
         actor_ema: float = 0.001,
         lr: float = 3e-4,
         lr_schedule: Literal["constant", "cosine"] = "constant",
+        fourier_features: int = 0,
+        fourier_scale: float = 1.0,
+        fourier_seen: int = 0,
         init_from: str | None = None,
         refit_normaliser: bool = False,
     ) -> None:
@@ -91,22 +98,21 @@ class IDQL(CriticModule):
         rules = [
             ("tau", 0 < tau < 1, "in (0, 1)"),
             ("samples", samples >= 1, "at least 1"),
-            ("diffusion_steps", diffusion_steps >= 1, "at least 1"),
             ("target_ema", 0 < target_ema <= 1, "in (0, 1]"),
             ("actor_ema", 0 < actor_ema <= 1, "in (0, 1]"),
         ]
         self._refuse(rules)
-        self.normaliser = Normaliser(observation_dim)
+        width = self._make_embedding(self.hparams)
         self.action_box = ActionBox(action_dim)
-        self.value = MLP(observation_dim, 1, hidden_dims)
-        self.critic = TwinCritic(observation_dim, action_dim, hidden_dims)
-        shape = (observation_dim, action_dim, 0, hidden_dim, blocks, dropout, diffusion_steps)
+        self.value = MLP(width, 1, hidden_dims)
+        self.critic = TwinCritic(width, action_dim, hidden_dims)
+        shape = (width, action_dim, 0, hidden_dim, blocks, dropout, diffusion_steps)
         self.actor, self.target_actor = with_target(lambda: DiffusionDecoder(*shape))
         self._begin(init_from)
 
     def loss(self, batch: Batch) -> Loss:
         """Equations 3, 4 and 9, summed; their parameters are disjoint."""
-        x, after = self.normaliser(batch["observations"]), self.normaliser(batch["next_observations"])
+        x, after = self.embed(batch["observations"]), self.embed(batch["next_observations"])
         chosen = self.action_box.to_unit(batch["actions"])
         terms = implicit(self.critic, self.value, x, after, batch, chosen, self.hparams.tau)
         advantages = terms.pop("advantages")
@@ -127,7 +133,7 @@ class IDQL(CriticModule):
 
     def act(self, observations: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Actions (B, A) for observations (B, O)."""
-        h, x = self.hparams, self.normaliser(observations)
+        h, x = self.hparams, self.embed(observations)
         proposed, q = proposals(self.target_actor, self.critic, x, h.samples, generator)
         index = q.argmax(dim=-1)
         if h.selection == "weighted":

@@ -9,6 +9,9 @@
 
 The network predicts noise, and ``|| z - z_hat ||^2 = || eps - eps_hat ||^2 / SNR(t)``, so the prior's loss is the same.
 Departures: z is the mean of q, T follows our decoder's schedule, and the data are drawn evenly, without priorities.
+The authors' code takes the skill that is best for one target critic, and there the smaller of both values; here the
+smaller of both is taken for every skill, and then the best. Their encoder keeps close to a prior that depends on the
+state, ours to N(0, I).
 """
 
 from __future__ import annotations
@@ -22,7 +25,10 @@ from torch import Tensor, nn
 import dds_lightning.losses as losses
 from dds_lightning.baselines.critics import Batch, Loss, TwinCritic, proposals, take
 from dds_lightning.baselines.opal import LatentModule
+from dds_lightning.errors import UserError
+from dds_lightning.module import planned_steps
 from dds_lightning.nn.diffusion import DiffusionDecoder
+from dds_lightning.nn.embedding import FOURIER
 from dds_lightning.nn.normaliser import Normaliser
 
 
@@ -43,6 +49,9 @@ class LDCQ(LatentModule):
         target_ema: Rate of the target critic.
         lr: Adam's learning rate.
         lr_schedule: ``constant``, or ``cosine`` decay to zero at ``max_steps``.
+        fourier_features: Frequencies that all networks see beside the observation; 0 for none. Ours takes 64 in mazes.
+        fourier_scale: Standard deviation of those frequencies.
+        fourier_seen: How many leading numbers of the observation they see; 0 for all.
         init_from: ``.ckpt`` or published directory with the initial weights (`dds_lightning.finetune`).
         skill_hash: Fingerprint of the skill model, linked from the data; null if unknown.
 
@@ -52,7 +61,7 @@ class LDCQ(LatentModule):
 
     STAGE = "ldcq"
     PARTS: ClassVar = {"prior": ("prior",), "critic": ("critic",)}
-    SHAPE = ("skill_dim", "hidden_dims", "hidden_dim", "blocks", "diffusion_steps")
+    SHAPE = ("skill_dim", "hidden_dims", "hidden_dim", "blocks", "diffusion_steps", *FOURIER)
 
     def __init__(
         self,
@@ -69,6 +78,9 @@ class LDCQ(LatentModule):
         target_ema: float = 0.005,
         lr: float = 5e-4,
         lr_schedule: Literal["constant", "cosine"] = "constant",
+        fourier_features: int = 0,
+        fourier_scale: float = 1.0,
+        fourier_seen: int = 0,
         init_from: str | None = None,
         skill_hash: str | None = None,
     ) -> None:
@@ -80,30 +92,39 @@ class LDCQ(LatentModule):
             ("samples", samples >= 1, "at least 1"),
             ("backup_samples", backup_samples >= 1, "at least 1"),
             ("snr_clip", snr_clip > 0, "positive"),
-            ("diffusion_steps", diffusion_steps >= 1, "at least 1"),
             ("target_ema", 0 < target_ema <= 1, "in (0, 1]"),
         ]
         self._refuse(rules)
-        self.normaliser, self.skills = Normaliser(observation_dim), Normaliser(skill_dim)
-        shape = (observation_dim, skill_dim, 0, hidden_dim, blocks, 0.0, diffusion_steps)
+        width, self.skills = self._make_embedding(self.hparams), Normaliser(skill_dim)
+        shape = (width, skill_dim, 0, hidden_dim, blocks, 0.0, diffusion_steps)
         self.prior = DiffusionDecoder(*shape, clip=False)  # skills lie in no box
-        self.critic = TwinCritic(observation_dim, skill_dim, hidden_dims)
+        self.critic = TwinCritic(width, skill_dim, hidden_dims)
         self._begin(init_from)
 
     def loss(self, batch: Batch) -> Loss:
         """Equation 6 in the first ``prior_steps`` steps, equation 7 after."""
-        x, z = self.normaliser(batch["observations"]), self.skills(batch["actions"])
+        x, z = self.embed(batch["observations"]), self.skills(batch["actions"])
         if "prior" in self.learning:
             return self._sum({"prior_loss": self.prior_loss(x, z)}, {})
         q = self.critic.both(x, z)
         return self._sum({"q_loss": losses.td(q, self._target(batch))}, {"q_mean": q.mean()})
+
+    def on_fit_start(self) -> None:
+        """As of a `LatentModule`; refuse a training that would end before the critic's began."""
+        last, first = planned_steps(self.trainer), self.hparams.prior_steps
+        if 0 <= last <= first:
+            raise UserError(
+                f"model.prior_steps is {first}, expected less than the {last} steps of the training: "
+                "the critic learns in those that follow, and it chooses"
+            )
+        super().on_fit_start()
 
     def learning_at(self, step: int) -> tuple[str, ...]:
         """First the prior, then the critic."""
         return ("prior",) if step < self.hparams.prior_steps else ("critic",)
 
     def prior_loss(self, states: Tensor, skills: Tensor) -> Tensor:
-        """Equation 6 for normalised states (B, O) and skills (B, D), the mean over B and D."""
+        """Equation 6 for embedded states (B, F) and skills (B, D), the mean over B and D."""
         t = torch.randint(self.prior.diffusion_steps, (len(skills),), device=skills.device)
         noise = torch.randn_like(skills)
         kept = self.prior.alpha_bars[t, None]
@@ -114,7 +135,7 @@ class LDCQ(LatentModule):
 
     @torch.no_grad()
     def _target(self, batch: Batch) -> Tensor:
-        states = self.normaliser(batch["next_observations"])
+        states = self.embed(batch["next_observations"])
         _, q = proposals(self.prior, self.critic, states, self.hparams.backup_samples)
         return losses.td_target(batch["rewards"], batch["discounts"], batch["dones"], q.amax(dim=-1))
 

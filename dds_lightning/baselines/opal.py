@@ -7,7 +7,8 @@
  L_pi = -E[ min(exp(beta u), 100) log pi(z | s) ]                                          IQL, equation 7
 ```
 
-OPAL relabels with draws from q and trains by CQL offline; here z is the mean of q, and the critic is IQL's.
+OPAL relabels with draws from q and trains by CQL offline; here z is the mean of q, and the critic is IQL's. Its encoder
+keeps close to a prior that depends on the state; ours to N(0, I).
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import dds_lightning.losses as losses
 from dds_lightning.baselines.critics import Batch, CriticModule, Loss, TwinCritic, implicit
 from dds_lightning.errors import UserError
 from dds_lightning.nn.draws import normal
+from dds_lightning.nn.embedding import FOURIER
 from dds_lightning.nn.mlp import MLP
 from dds_lightning.nn.normaliser import Normaliser
 
@@ -68,11 +70,11 @@ class LatentModule(CriticModule):
         """
         if selection not in ("sample", "greedy"):
             raise UserError(f"selection is '{selection}', expected sample or greedy: continuous skills have no codes")
-        chosen = self.propose(self.normaliser(observations), selection == "greedy", generator)
+        chosen = self.propose(self.embed(observations), selection == "greedy", generator)
         return self.skills.mean + self.skills.std * chosen
 
     def propose(self, states: Tensor, greedy: bool, generator: torch.Generator | None) -> Tensor:
-        """Normalised skills (B, D) for normalised states (B, O)."""
+        """Normalised skills (B, D) for embedded states (B, F)."""
         raise NotImplementedError
 
     def predict_step(self, batch: Batch, batch_idx: int) -> Tensor:
@@ -93,6 +95,9 @@ class OPAL(LatentModule):
         target_ema: Rate of the target critic.
         lr: Adam's learning rate.
         lr_schedule: ``constant``, or ``cosine`` decay to zero at ``max_steps``.
+        fourier_features: Frequencies that all networks see beside the observation; 0 for none. Ours takes 64 in mazes.
+        fourier_scale: Standard deviation of those frequencies.
+        fourier_seen: How many leading numbers of the observation they see; 0 for all.
         init_from: ``.ckpt`` or published directory with the initial weights (`dds_lightning.finetune`).
         skill_hash: Fingerprint of the skill model, linked from the data; null if unknown.
 
@@ -102,7 +107,7 @@ class OPAL(LatentModule):
 
     STAGE = "opal"
     PARTS: ClassVar = {"critic": ("value", "critic"), "actor": ("actor",)}
-    SHAPE = ("skill_dim", "hidden_dims")
+    SHAPE = ("skill_dim", "hidden_dims", *FOURIER)
 
     def __init__(
         self,
@@ -115,6 +120,9 @@ class OPAL(LatentModule):
         target_ema: float = 0.005,
         lr: float = 3e-4,
         lr_schedule: Literal["constant", "cosine"] = "constant",
+        fourier_features: int = 0,
+        fourier_scale: float = 1.0,
+        fourier_seen: int = 0,
         init_from: str | None = None,
         skill_hash: str | None = None,
     ) -> None:
@@ -128,21 +136,21 @@ class OPAL(LatentModule):
             ("target_ema", 0 < target_ema <= 1, "in (0, 1]"),
         ]
         self._refuse(rules)
-        self.normaliser, self.skills = Normaliser(observation_dim), Normaliser(skill_dim)
-        self.value = MLP(observation_dim, 1, hidden_dims)
-        self.critic = TwinCritic(observation_dim, skill_dim, hidden_dims)
-        self.actor = MLP(observation_dim, skill_dim, hidden_dims)
+        width, self.skills = self._make_embedding(self.hparams), Normaliser(skill_dim)
+        self.value = MLP(width, 1, hidden_dims)
+        self.critic = TwinCritic(width, skill_dim, hidden_dims)
+        self.actor = MLP(width, skill_dim, hidden_dims)
         self.actor.register_parameter("log_std", nn.Parameter(torch.zeros(skill_dim)))  # the same in every state
         self._begin(init_from)
 
     def policy(self, states: Tensor) -> torch.distributions.Normal:
-        """pi(z | s) over normalised skills, for normalised states (B, O)."""
+        """pi(z | s) over normalised skills, for embedded states (B, F)."""
         log_std: Any = self.actor.log_std
         return torch.distributions.Normal(self.actor(states), log_std.clamp(*LOG_STD).exp(), validate_args=False)
 
     def loss(self, batch: Batch) -> Loss:
         """IQL's equations 5 to 7, summed; their parameters are disjoint."""
-        x, after = self.normaliser(batch["observations"]), self.normaliser(batch["next_observations"])
+        x, after = self.embed(batch["observations"]), self.embed(batch["next_observations"])
         z = self.skills(batch["actions"])
         terms = implicit(self.critic, self.value, x, after, batch, z, self.hparams.tau)
         advantages = terms.pop("advantages")

@@ -64,6 +64,7 @@ BUDGETS = (
     "model.critic_steps",  # a critic that never stops would leave the actor no step
     "model.freeze_codes_after",
     "model.warmup_steps",
+    "model.actor_ema_start",
     "stop.min_steps",
     "stop.decay",
 )

@@ -186,6 +186,7 @@ class _Planner:
             reads["relabel"] = Node(
                 "relabel", "dds_lightning.grid.work:relabel", own, dict(reads), f"relabel {cell.name()}"
             )
+        settings = {key: value for key, value in settings.items() if key not in row.added or value != row.added[key]}
         settings |= {**self._task(cell), "seed": cell.seed, "stage": stage}
         return Node(stage, "dds_lightning.grid.work:train", settings, reads, f"{stage} {cell.name()}", how)
 

@@ -28,8 +28,9 @@ import dds_lightning.losses as losses
 from dds_lightning.errors import UserError
 from dds_lightning.module import StageModule, adam, is_log_step
 from dds_lightning.nn.draws import categorical
-from dds_lightning.nn.mlp import MLP, FourierFeatures
-from dds_lightning.nn.normaliser import ActionBox, Normaliser
+from dds_lightning.nn.embedding import FOURIER
+from dds_lightning.nn.mlp import MLP
+from dds_lightning.nn.normaliser import ActionBox
 from dds_lightning.online.follower import Follower
 from dds_lightning.online.heads import BoxHead, CodeHead
 from dds_lightning.online.novelty import Novelty
@@ -86,7 +87,7 @@ class SACModule(StageModule):
     PREDICTION = "choice"
     PARTS: ClassVar = {"critic": ("critic", "target_critic"), "actor": ("actor",)}
     SHAPE = (
-        *("space", "choices", "hidden_dims", "layer_norm", "fourier_features", "fourier_scale", "fourier_seen"),
+        *("space", "choices", "hidden_dims", "layer_norm", *FOURIER),
         "critics",
     )
     support_mask: Tensor
@@ -127,7 +128,6 @@ class SACModule(StageModule):
         entropy = target_entropy is None or not discrete or 0 <= target_entropy <= 1
         rules = [
             ("choices", choices >= (2 if discrete else 1), "2 codes or more, or 1 number or more"),
-            ("fourier_seen", 0 <= fourier_seen <= observation_dim, f"in [0, {observation_dim}]"),
             ("critics", critics >= 1, "at least 1"),
             ("temperature", temperature > 0, "positive"),
             ("target_entropy", entropy, "null or a share of log K in [0, 1]"),
@@ -139,13 +139,8 @@ class SACModule(StageModule):
         ]
         self._refuse(rules)
         self.num_skills = choices if discrete else 0
-        self.normaliser = Normaliser(observation_dim)
+        width = self._make_embedding(self.hparams)
         self.action_box = ActionBox(0 if discrete else choices)
-        self.features: nn.Module = nn.Identity()
-        width = observation_dim
-        if fourier_features:
-            self.features = FourierFeatures(observation_dim, fourier_features, fourier_scale, fourier_seen)
-            width = self.features.output_dim
         self.actor = (CodeHead if discrete else BoxHead)(width, choices, hidden_dims)
         shape = (width + self.actor.takes, self.actor.outputs, hidden_dims, layer_norm, critics)
         self.critic, self.target_critic = MLP(*shape), MLP(*shape)
@@ -177,10 +172,6 @@ class SACModule(StageModule):
     def discrete(self) -> bool:
         """Whether the choice is among codes."""
         return self.num_skills > 0
-
-    def embed(self, observations: Tensor) -> Tensor:
-        """Normalise observations (B, O) and append Fourier features."""
-        return self.features(self.normaliser(observations))
 
     def logits(self, observations: Tensor) -> Tensor:
         """Unnormalised log pi(k | s) of a policy over codes: (B, O) to (B, K)."""

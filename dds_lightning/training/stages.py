@@ -39,6 +39,8 @@ class Stage:
         metrics: Names of everything that its `fit` can log, whatever its settings; empty where nobody has listed them.
         reads: Stages whose checkpoint it needs, and the setting that takes it.
         in_run: Whether `dds run` knows its settings; baselines are trained by `dds STAGE fit` and `dds study` alone.
+        added: Settings that it has not had from the beginning, with the values that change nothing: a study goes on
+            with what was trained without them.
         commands: What its help lists beside `fit`, name to one line; None lists Lightning's others.
     """
 
@@ -55,6 +57,7 @@ class Stage:
     metrics: tuple[str, ...] = ()
     reads: Mapping[str, str] = field(default_factory=dict)
     in_run: bool = True
+    added: Mapping[str, Any] = field(default_factory=dict)
     commands: Mapping[str, str] | None = None
 
     def module_class(self) -> type[StageModule]:
@@ -76,6 +79,9 @@ _POLICY_TERMS = (
 )
 
 
+_NO_FOURIER = {"model.fourier_features": 0, "model.fourier_scale": 1.0, "model.fourier_seen": 0}
+
+
 def _baseline(
     name: str,
     description: str,
@@ -95,7 +101,7 @@ def _baseline(
         preset=f"{name}.yaml",
         threads=1,
         in_run=False,
-        **{"widths": "model.hidden_dims", **more},
+        **{"widths": "model.hidden_dims", "added": _NO_FOURIER, **more},
     )
 
 
@@ -138,6 +144,7 @@ STAGES: dict[str, Stage] = {
             widths="model.hidden_dims",
             preset="clone.yaml",
             threads=1,  # more gain little on an idle machine and cost much on a busy one
+            added=_NO_FOURIER,
             metrics=_named(train="loss", val="loss"),
         ),
         Stage(
@@ -178,6 +185,7 @@ STAGES: dict[str, Stage] = {
             "SequenceDataModule",
             ("observation_dim", "action_dim", "horizon"),
             widths="data.horizon or model.hidden_dim",
+            added={},
         ),
         _baseline("opal", "OPAL: IQL over continuous skills.", "opal:OPAL", "LatentDataModule", _LATENT, reads=_SKILL),
         _baseline(

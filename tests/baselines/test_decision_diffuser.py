@@ -82,3 +82,13 @@ def test_it_plans_for_the_mode_that_pays():
     module = DecisionDiffuser(2, 1, 4, hidden_dim=32, blocks=2, diffusion_steps=8, lr=2e-3)
     train(module, data, 600)
     assert regret(ModuleActor(module)) < 0.25  # of 0.6; it asks for 0.9 of the best return, at every step
+
+
+def test_a_return_of_one_is_the_greatest_of_any_step_and_not_of_the_first_ones_alone():
+    data = two_modes(20)
+    data.rewards[:] = 0.0
+    data.rewards[data.step_offsets[:-1] + 4] = -3.0  # behind it more is to be earned than at the start
+    module = SequenceDataModule.from_trajectories(data, horizon=4, gamma=1.0)
+    found = module.statistics()
+    assert found["return_range"].tolist() == [-3.0, -3.0]
+    assert found["return_to_go_range"].tolist() == [-3.0, 0.0]

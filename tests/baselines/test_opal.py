@@ -116,3 +116,9 @@ def test_discrete_skills_are_refused(tmp_path):
         LatentDataModule.from_trajectories(two_modes(20), skill=str(tmp_path / "vq.ckpt"))
     with pytest.raises(UserError, match=r"data\.skill is missing"):
         LatentDataModule()
+
+
+def test_a_training_that_would_leave_the_critic_no_step_is_refused(skills):
+    module = LDCQ(2, 4, [8], prior_steps=5, hidden_dim=8, blocks=1, diffusion_steps=2)
+    with pytest.raises(UserError, match=r"model\.prior_steps is 5, expected less than the 5 steps"):
+        train(module, data_of(skills), 5)

@@ -20,7 +20,7 @@ MODULES = {
     "dql": lambda: DiffusionQL(2, 1, [8], blocks=1, actor_ema_start=2, actor_ema_every=1, **SMALL),
     "dd": lambda: DecisionDiffuser(2, 1, 4, blocks=1, **SMALL),
     "opal": lambda: OPAL(2, 4, [8]),
-    "ldcq": lambda: LDCQ(2, 4, [8], blocks=1, prior_steps=6, backup_samples=2, **SMALL),
+    "ldcq": lambda: LDCQ(2, 4, [8], blocks=1, prior_steps=3, backup_samples=2, **SMALL),
 }
 
 
