@@ -7,63 +7,28 @@
  a = f(s_1, s_2)                                                                                             equation 5
 ```
 
-The present state is given and not diffused, as in the authors' code; their temporal U-Net is here a stack of dilated
-convolutions, and their 200 steps of diffusion are `diffusion_steps` of our decoder's schedule.
+The present state is given and not diffused, as in the authors' code. Departures: a plan is diffused as its differences
+from the present state, each divided by its spread in the data, so that the next state, which alone decides the action,
+is as fine as the last; the temporal U-Net is our decoder's network over the whole plan; T and the noise follow our
+decoder's schedule, in place of 200 steps.
 """
 
 from __future__ import annotations
 
+import itertools
 from typing import ClassVar, Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from dds_lightning.baselines.critics import Batch
 from dds_lightning.module import StageModule
 from dds_lightning.nn.diffusion import DiffusionDecoder
 from dds_lightning.nn.mlp import MLP
-from dds_lightning.nn.normaliser import ActionBox, Normaliser
+from dds_lightning.nn.normaliser import MIN_STD, ActionBox
 
-TIME = 16
-"""Width of the embedding of the diffusion step."""
-KERNEL = 5
-
-
-class PlanNetwork(nn.Module):
-    """Noise of a plan, by residual convolutions over its steps; each step sees all others through the dilations.
-
-    Args:
-        observation_dim: O.
-        horizon: H.
-        hidden_dim: Channels.
-        blocks: Number of residual blocks; block i has dilation 2^i.
-    """
-
-    def __init__(self, observation_dim: int, horizon: int, hidden_dim: int, blocks: int) -> None:
-        super().__init__()
-        self.shape = (horizon - 1, observation_dim)
-        self.input = nn.Conv1d(observation_dim, hidden_dim, 1)
-        self.condition = nn.Linear(TIME + 2, blocks * hidden_dim)
-        self.blocks = nn.ModuleList(
-            nn.Sequential(
-                nn.Conv1d(hidden_dim, hidden_dim, KERNEL, padding=KERNEL // 2 * 2**i, dilation=2**i),
-                nn.GroupNorm(1, hidden_dim),
-                nn.Mish(),
-                nn.Conv1d(hidden_dim, hidden_dim, 1),
-            )
-            for i in range(blocks)
-        )
-        self.output = nn.Conv1d(hidden_dim, observation_dim, 1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(B, (H - 1) O + `TIME` + 2 + O), as `DiffusionDecoder` concatenates it, to (B, (H - 1) O)."""
-        steps, width = self.shape
-        noisy, condition, present = x.split([steps * width, TIME + 2, width], dim=-1)
-        plan = torch.cat([present, noisy], dim=-1).view(len(x), steps + 1, width).transpose(1, 2)  # (B, O, H)
-        h = self.input(plan)
-        for block, shift in zip(self.blocks, self.condition(condition).chunk(len(self.blocks), dim=-1), strict=True):
-            h = h + block(h + shift[..., None])
-        return self.output(h)[..., 1:].transpose(1, 2).flatten(1)
+BATCHES = 20
+"""Batches in which the spread of plans is measured."""
 
 
 class PlanDiffusion(DiffusionDecoder):
@@ -88,8 +53,8 @@ class DecisionDiffuser(StageModule):
         observation_dim: O, linked from the data on the command line.
         action_dim: A, linked from the data.
         horizon: H, at least 2; linked from the data. The authors take 100.
-        hidden_dim: Channels of the plan network; the inverse dynamics have twice as many.
-        blocks: Its residual blocks.
+        hidden_dim: Width of the plan network and of the inverse dynamics.
+        blocks: Residual blocks of the former.
         diffusion_steps: T.
         untold: p, share of plans that learn without their return.
         guidance: w.
@@ -107,17 +72,18 @@ class DecisionDiffuser(StageModule):
     STAGE = "dd"
     PARTS: ClassVar = {"plans": ("plans",), "inverse": ("inverse",)}
     SHAPE = ("horizon", "hidden_dim", "blocks", "diffusion_steps")
-    OF_DATA = ("return_range",)
+    OF_DATA = ("return_range", "plan_spread")
     PREDICTION = "action"
     return_range: Tensor
+    plan_spread: Tensor
 
     def __init__(
         self,
         observation_dim: int,
         action_dim: int,
         horizon: int = 20,
-        hidden_dim: int = 128,
-        blocks: int = 4,
+        hidden_dim: int = 256,
+        blocks: int = 3,
         diffusion_steps: int = 20,
         untold: float = 0.25,
         guidance: float = 1.2,
@@ -136,19 +102,21 @@ class DecisionDiffuser(StageModule):
             ("noise_scale", noise_scale >= 0, "0 or more"),
         ]
         self._refuse(rules)
-        self.normaliser = Normaliser(observation_dim)
+        self._make_embedding(self.hparams)
         self.action_box = ActionBox(action_dim)
         self.plans = PlanDiffusion(
             observation_dim,
             (horizon - 1) * observation_dim,
             2,
+            hidden_dim,
+            blocks,
+            dropout=0.0,
             diffusion_steps=diffusion_steps,
-            time_dim=TIME,
             clip=False,
-            net=PlanNetwork(observation_dim, horizon, hidden_dim, blocks),
         )
-        self.inverse = MLP(2 * observation_dim, action_dim, [2 * hidden_dim, 2 * hidden_dim])
+        self.inverse = MLP(2 * observation_dim, action_dim, [hidden_dim, hidden_dim])
         self.register_buffer("return_range", torch.tensor([0.0, 1.0]))
+        self.register_buffer("plan_spread", torch.ones(horizon - 1, observation_dim))
         self._begin(init_from)
 
     def on_fit_start(self) -> None:
@@ -158,6 +126,14 @@ class DecisionDiffuser(StageModule):
         if not fitted or self.init_from is not None:
             found = self.data_statistics(["return_to_go_range"], "use a SequenceDataModule")
             self.return_range.copy_(found["return_to_go_range"])
+            batches = itertools.islice(self.training_batches(), BATCHES)
+            ahead = torch.cat([self.ahead(self.normaliser(batch["observations"])) for batch in batches])
+            self.plan_spread.copy_(ahead.square().mean(dim=0).sqrt().clamp_min(MIN_STD))
+
+    @staticmethod
+    def ahead(states: Tensor) -> Tensor:
+        """Where a plan leads from its first state: normalised states (B, H, O) to differences (B, H - 1, O)."""
+        return states[:, 1:] - states[:, :1]
 
     def scaled(self, returns: Tensor) -> Tensor:
         """Returns to go in [0, 1], where 1 is the greatest of any step of the data."""
@@ -169,7 +145,8 @@ class DecisionDiffuser(StageModule):
         x = self.normaliser(batch["observations"])  # (B, H, O)
         told = (torch.rand(len(x), 1, device=x.device) >= self.hparams.untold).float()
         wanted = torch.cat([self.scaled(batch["returns"][:, :1]) * told, told], dim=-1)
-        denoising = 0.5 * self.plans.loss(x[:, 1:].flatten(1), x[:, 0], wanted).mean()
+        plan = (self.ahead(x) / self.plan_spread).flatten(1)
+        denoising = 0.5 * self.plans.loss(plan, x[:, 0], wanted).mean()
         taken = self.action_box.to_unit(batch["actions"][:, :-1])  # (B, H - 1, A)
         inverse = 0.5 * (self._between(x[:, :-1], x[:, 1:]) - taken).square().mean()
         return denoising + inverse, {"denoising": denoising.detach(), "inverse": inverse.detach()}
@@ -194,7 +171,8 @@ class DecisionDiffuser(StageModule):
         """The next H - 1 states (B, H - 1, O), normalised, from observations (B, O)."""
         h, x = self.hparams, self.normaliser(observations)
         asked = torch.tensor([h.target, 1.0, h.guidance], device=x.device).expand(len(x), 3)
-        return self.plans.sample(x, asked, h.noise_scale, generator).view(len(x), h.horizon - 1, -1)
+        drawn = self.plans.sample(x, asked, h.noise_scale, generator).view(len(x), h.horizon - 1, -1)
+        return x[:, None] + self.plan_spread * drawn
 
     def act(self, observations: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Actions (B, A) for observations (B, O)."""

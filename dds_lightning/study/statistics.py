@@ -97,7 +97,8 @@ def evaluation_curve(
     An offline method leaves one policy for each of its settings; finding the best costs episodes in the environment. In
     each repeat some of the policies are arms, and a pull draws one of the arm's recorded episodes. Every arm is pulled
     once, then the one with the greatest mean + alpha sqrt(log n / n_arm) in units of the spread of all episodes; the
-    one with the greatest mean would be deployed.
+    one with the greatest mean would be deployed. The question is that of Jackson et al. (2025); the weight of the bonus
+    and its unit are our own, so curves are to be compared with each other and not with theirs.
 
     Args:
         returns: (P, E) scores of E episodes of each of P policies.

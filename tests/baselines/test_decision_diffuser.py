@@ -26,6 +26,7 @@ def test_the_losses_are_the_authors_formulas():
     torch.manual_seed(0)
     module, batch = small(untold=0.5), sequences()
     module.return_range.copy_(torch.tensor([1.0, 3.0]))
+    module.plan_spread.copy_(torch.tensor([0.5, 1.0, 2.0])[:, None].expand(3, 3))
     torch.manual_seed(1)
     total, terms = module.loss(batch)
     torch.manual_seed(1)
@@ -33,9 +34,10 @@ def test_the_losses_are_the_authors_formulas():
     assert 0 < told.mean() < 1
     y = (batch["returns"][:, :1] - 1.0) / 2.0
     x = batch["observations"]
+    ahead = ((x[:, 1:] - x[:, :1]) / torch.tensor([0.5, 1.0, 2.0])[:, None]).reshape(16, 9)
     t, noise = torch.randint(5, (16,)), torch.randn(16, 9)
     kept = module.plans.alpha_bars[t, None]
-    noisy = kept.sqrt() * x[:, 1:].reshape(16, 9) + (1 - kept).sqrt() * noise
+    noisy = kept.sqrt() * ahead + (1 - kept).sqrt() * noise
     seen = torch.cat([noisy, module.plans.time_table[t], y * told, told, x[:, 0]], -1)
     denoising = 0.5 * ((noise - module.plans.net(seen)) ** 2).mean()
     inverse = 0.5 * ((batch["actions"][:, :3] - module.inverse(torch.cat([x[:, :3], x[:, 1:]], -1))) ** 2).mean()
@@ -82,6 +84,10 @@ def test_it_plans_for_the_mode_that_pays():
     module = DecisionDiffuser(2, 1, 4, hidden_dim=32, blocks=2, diffusion_steps=8, lr=2e-3)
     train(module, data, 600)
     assert regret(ModuleActor(module)) < 0.25  # of 0.6; it asks for 0.9 of the best return, at every step
+    start = torch.tensor([[0.0, 1.0]]).expand(200, 2)
+    ahead = module.plan(start)[:, 0] * module.normaliser.std + module.normaliser.mean - start
+    assert 0.06 < ahead[:, 0].mean() < 0.18  # a step of the mode that pays goes 0.12 ahead
+    assert ahead[:, 1].abs().max() < 0.05  # and who pays stays
 
 
 def test_a_return_of_one_is_the_greatest_of_any_step_and_not_of_the_first_ones_alone():
