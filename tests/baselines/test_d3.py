@@ -1,8 +1,10 @@
 """d3rlpy's algorithms as stages: its losses on our batches, exact resuming, its files, and the toy of two modes."""
 
+import itertools
 import subprocess
 import sys
 
+import lightning.pytorch as pl
 import numpy as np
 import pytest
 import torch
@@ -46,6 +48,14 @@ def test_nothing_is_imported_before_it_is_used():
     code = "import dds_lightning.baselines.d3, dds_lightning.baselines.decision_transformer as x, sys"
     code += "; sys.exit('d3rlpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+class Reseed(pl.Callback):
+    """Lets a training draw the noise that another one drew."""
+
+    def on_train_batch_start(self, trainer, pl_module, batch, batch_idx):
+        if batch_idx == 0:
+            torch.manual_seed(1)
 
 
 class TestWithD3rlpy:
@@ -143,6 +153,45 @@ class TestWithD3rlpy:
         module.trainer.save_checkpoint(tmp_path / "last.ckpt")
         actor = METHODS[name].play({name: str(tmp_path / "last.ckpt")})
         assert regret(actor) < (0.25 if name == "cql" else 0.15)  # of 0.6, what imitation of both modes loses
+
+    @pytest.mark.parametrize("name", FLAT)
+    def test_the_same_batches_give_the_weights_that_d3rlpy_alone_learns(self, name):
+        """Hence what its training scores otherwise than ours is a matter of seeds and of the order of batches."""
+        import d3rlpy
+
+        def data():
+            return TransitionDataModule.from_trajectories(two_modes(80), batch_size=32, gamma=0.99)
+
+        torch.manual_seed(0)
+        ours = module_of(name)
+        theirs = ours.algorithm.config.create("cpu:0")
+        theirs.create_impl((2,), 1)
+        parts = vars(theirs.impl.modules)
+        for part, network in ours.networks.items():
+            parts[part].load_state_dict(network.state_dict())
+        train(ours, data(), 12, callbacks=[Reseed()])
+        torch.manual_seed(1)
+        statistics = data().statistics()
+        scaler = d3rlpy.preprocessing.StandardObservationScaler(
+            mean=statistics["observation_mean"].numpy(), std=statistics["observation_std"].numpy(), eps=0.0
+        )
+        for batch in itertools.islice(data().train_dataloader(), 12):
+            flat = {key: value.numpy() for key, value in batch.items()}
+            theirs.update(
+                d3rlpy.dataset.TransitionMiniBatch(
+                    observations=scaler.transform_numpy(flat["observations"]).astype(np.float32),
+                    actions=ours.action_box.to_unit(batch["actions"]).numpy(),
+                    rewards=flat["rewards"][:, None],
+                    next_observations=scaler.transform_numpy(flat["next_observations"]).astype(np.float32),
+                    next_actions=np.zeros_like(flat["actions"]),
+                    terminals=flat["dones"][:, None],
+                    intervals=np.ones((32, 1), np.float32),
+                    transitions=[],
+                )
+            )
+        for part, network in ours.networks.items():
+            for key, value in network.state_dict().items():
+                assert torch.allclose(value, parts[part].state_dict()[key], atol=1e-5), (part, key)
 
     def test_its_own_file_acts_alike(self, tmp_path):
         import d3rlpy
