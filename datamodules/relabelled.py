@@ -22,6 +22,7 @@ from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError, refuse_seed
 from dds_lightning.nn.precision import fastest_precision
 from dds_lightning.saving.files import home
+from dds_lightning.saving.fingerprint import halves
 from dds_lightning.skill import SkillModule
 from dds_lightning.tasks import Task, get_task
 
@@ -33,8 +34,8 @@ LONG = 20_000
 class RelabeledDataModule(pl.LightningDataModule):
     """Semi-MDP transitions of a data set under the skills of a checkpoint.
 
-    Relabelling runs once: its result is stored under ``cache`` in a file named after the hash of data, skill weights,
-    H and every field of `Relabelling`, so that nothing stale is ever read.
+    Relabelling runs once: its result is stored under ``cache`` in a file named after the hash of data, all that decides
+    the codes of the skills, and every field of `Relabelling`, so that nothing stale is ever read.
 
     Args:
         task: Name of a task (``dds tasks``); null for your own data. After ``setup`` the attribute ``task`` is the
@@ -130,9 +131,12 @@ class RelabeledDataModule(pl.LightningDataModule):
         return relabel_key(self.trajectories, self.skill, self.relabelling.for_task(self.task))
 
     def cache_file(self) -> Path:
-        """File of the relabelled data of exactly these inputs."""
-        name = hashlib.sha256(json.dumps(self.key, sort_keys=True).encode()).hexdigest()[:16]
-        return self._cache_folder() / f"relabelled-{name}.safetensors"
+        """File of the relabelled data of exactly these inputs, whatever the decoder, or that of an earlier version."""
+        codes, whole = halves(self.skill_hash)
+        keys = [json.dumps({**self.key, "skill": skill}, sort_keys=True) for skill in (codes, whole)]
+        names = [hashlib.sha256(key.encode()).hexdigest()[:16] for key in keys]
+        files = [self._cache_folder() / f"relabelled-{name}.safetensors" for name in names]
+        return next((file for file in files if file.exists()), files[0])
 
     def _cache_folder(self) -> Path:
         """The given folder, else beside the checkpoint of a training; nothing is added to a published directory."""

@@ -1,6 +1,5 @@
 """What the modules of all training stages share: checked settings, trainable parts, and their optimiser."""
 
-import hashlib
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -17,6 +16,7 @@ from dds_lightning.errors import UserError
 from dds_lightning.finetune import read, refuse_other_box, start_from
 from dds_lightning.nn.normaliser import ActionBox, Normaliser
 from dds_lightning.saving.checkpoint import STAGE_KEY, load_module
+from dds_lightning.saving.fingerprint import digest
 
 Schedule = Literal["constant", "cosine"]
 
@@ -40,6 +40,10 @@ class StageModule(pl.LightningModule):
     """What `predict_step` returns one of for each row."""
     OF_DATA: ClassVar[tuple[str, ...]] = ()
     """Buffers that always come from the data."""
+    OF_DECODER: ClassVar[bool] = False
+    """Whether it learnt by acting, so that it belongs to the skills' decoder and not only to their codes."""
+    OPTIONAL: ClassVar[tuple[str, ...]] = ()
+    """Submodules that a checkpoint to start from may lack: then they begin as the data say."""
 
     normaliser: Normaliser
     action_box: ActionBox  # of modules that see actions
@@ -268,11 +272,7 @@ class StageModule(pl.LightningModule):
 
     def fingerprint(self) -> str:
         """SHA-256 of all weights and buffers with their names: the same for the same model, wherever it is stored."""
-        digest = hashlib.sha256()
-        for name, tensor in sorted(self.state_dict().items()):
-            digest.update(name.encode())
-            digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-        return digest.hexdigest()
+        return digest(self.state_dict())
 
     @classmethod
     def starting_from(cls, path: str | Path, **settings: Any) -> Self:

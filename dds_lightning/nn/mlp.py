@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -49,6 +49,8 @@ class FourierFeatures(nn.Module):
         seen: How many leading numbers of the input the frequencies see; 0 for all of them.
     """
 
+    SETTINGS: ClassVar = ("fourier_features", "fourier_scale", "fourier_seen")
+    """What a module calls the settings of its layer of this kind."""
     frequencies: Tensor
 
     def __init__(self, input_dim: int, features: int, scale: float, seen: int = 0) -> None:

@@ -84,11 +84,10 @@ class SACModule(StageModule):
 
     STAGE = "online"
     PREDICTION = "choice"
+    OF_DECODER = True
+    OPTIONAL = ("follower",)  # which then begins as data.skill
     PARTS: ClassVar = {"critic": ("critic", "target_critic"), "actor": ("actor",)}
-    SHAPE = (
-        *("space", "choices", "hidden_dims", "layer_norm", "fourier_features", "fourier_scale", "fourier_seen"),
-        "critics",
-    )
+    SHAPE = ("space", "choices", "hidden_dims", "layer_norm", *FourierFeatures.SETTINGS, "critics")
     support_mask: Tensor
     target_entropy: Tensor
 
@@ -170,7 +169,7 @@ class SACModule(StageModule):
 
     @property
     def skill_hash(self) -> str | None:
-        """Fingerprint of the skill model whose skills it chooses, as their decoder is now."""
+        """Fingerprint of the skill model whose skills it chooses, as their decoder is now: it belongs to that one."""
         return super().skill_hash if self.follower is None else self.follower.skill.fingerprint()
 
     @property
