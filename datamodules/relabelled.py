@@ -16,14 +16,13 @@ from datamodules.loader import TensorLoader, data_state, overfits, refuse_other_
 from datamodules.partial_codes import PartialCodes
 from datamodules.relabel import Relabelled, refuse_other_transitions, relabel, relabel_key
 from datamodules.relabelling import Relabelling
-from datamodules.robots import refuse_other_robot
+from datamodules.robots import load_skills
 from datamodules.sources import load_trajectories
 from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError, refuse_seed
 from dds_lightning.nn.precision import fastest_precision
 from dds_lightning.saving.files import home
 from dds_lightning.saving.fingerprint import halves
-from dds_lightning.skill import SkillModule
 from dds_lightning.tasks import Task, get_task
 
 log = logging.getLogger(__name__)
@@ -81,9 +80,7 @@ class RelabeledDataModule(pl.LightningDataModule):
             raise UserError("data.skill is missing: give the skill checkpoint (.ckpt or directory) to relabel with")
         if not 0.0 <= validation_fraction < 1.0:
             raise UserError(f"data.validation_fraction is {validation_fraction}, expected a share in [0, 1)")
-        self.skill = SkillModule.load(skill)
-        if self.task is not None:
-            refuse_other_robot(skill, self.task)
+        self.skill = load_skills(skill, self.task)
         self.observation_dim: int = self.skill.hparams.observation_dim
         self.num_skills: int = self.skill.num_skills
         self.skill_hash = self.skill.fingerprint()

@@ -52,7 +52,7 @@ ROOMS = {
     "datamodules.listing": "errors tasks datamodules.sources datamodules.storage datamodules.trajectories",
     "datamodules.partial_codes": "errors saving",
     "datamodules.relabelling": "envs errors tasks",
-    "datamodules.robots": "errors saving tasks",
+    "datamodules.robots": "errors saving skill tasks",
     "datamodules.relabel": "console envs errors saving skill datamodules.partial_codes datamodules.relabelling "
     "datamodules.trajectories",
     "datamodules.segments": "errors nn tasks datamodules.collect datamodules.loader datamodules.sources "
