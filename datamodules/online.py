@@ -22,12 +22,11 @@ from datamodules.loader import refuse_other_rounds
 from datamodules.relabel import Relabelled
 from datamodules.relabelled import RelabeledDataModule
 from datamodules.relabelling import Relabelling
-from datamodules.robots import refuse_other_robot
+from datamodules.robots import load_skills
 from dds_lightning.errors import UserError
 from dds_lightning.online.collector import Collector
 from dds_lightning.online.replay import Replay
 from dds_lightning.online.skill_env import BOUND, SkillEnv
-from dds_lightning.skill import SkillModule
 from dds_lightning.tasks import Task, get_task
 
 EPOCH = 1000
@@ -119,9 +118,7 @@ class OnlineDataModule(pl.LightningDataModule):
         for name, fine, expected in rules:
             if not fine:
                 raise UserError(f"data.{name} is {self.hparams[name]}, expected {expected}")
-        self.model = None if skill is None else SkillModule.load(skill)
-        if skill is not None:
-            refuse_other_robot(skill, self.task)
+        self.model = None if skill is None else load_skills(skill, self.task)
         self.skill = self.model if actions == "skills" else None
         self.space = "raw" if self.skill is None else "discrete" if self.skill.discrete else "continuous"
         if data is not None and self.space != "discrete":

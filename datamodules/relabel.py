@@ -33,6 +33,7 @@ from dds_lightning.envs.semi_mdp import fold
 from dds_lightning.errors import UserError
 from dds_lightning.saving.arrays import read_tensors
 from dds_lightning.saving.files import refuse_newer, written_whole
+from dds_lightning.saving.fingerprint import same
 from dds_lightning.saving.untrusted import mapping, parse_json
 from dds_lightning.skill import SkillModule
 
@@ -151,7 +152,9 @@ class Relabelled:
         except UserError as error:
             raise UserError(f"{path} is not a readable relabelled file ({error}): delete it and relabel") from error
         about = _about(metadata, path)
-        found = about["key"]
+        found = dict(about["key"])
+        if key and "skill" in key and same(str(found.get("skill")), str(key["skill"])):
+            found["skill"] = key["skill"]  # another decoder, or how an earlier version named these skills
         if key is not None and found != json.loads(json.dumps(key)):
             pairs = {name: (found.get(name), value) for name, value in key.items() if found.get(name) != value}
             wrong = [f"{name} {there!r} instead of {wanted!r}" for name, (there, wanted) in pairs.items()]
@@ -216,7 +219,7 @@ def relabel_key(
         **settings: Fields of `Relabelling` that differ from `relabelling`.
 
     Returns:
-        Hashes of data and weights, H, and every field of `Relabelling`.
+        Hashes of data and skills (`saving.fingerprint`), H, and every field of `Relabelling`.
     """
     settings = _resolved(relabelling, settings).settings()
     return {"data": trajectories.fingerprint(), "skill": skill.fingerprint(), "horizon": skill.horizon, **settings}

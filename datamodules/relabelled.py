@@ -16,13 +16,13 @@ from datamodules.loader import TensorLoader, data_state, overfits, refuse_other_
 from datamodules.partial_codes import PartialCodes
 from datamodules.relabel import Relabelled, refuse_other_transitions, relabel, relabel_key
 from datamodules.relabelling import Relabelling
-from datamodules.robots import refuse_other_robot
+from datamodules.robots import load_skills
 from datamodules.sources import load_trajectories
 from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError, refuse_seed
 from dds_lightning.nn.precision import fastest_precision
 from dds_lightning.saving.files import home
-from dds_lightning.skill import SkillModule
+from dds_lightning.saving.fingerprint import halves
 from dds_lightning.tasks import Task, get_task
 
 log = logging.getLogger(__name__)
@@ -33,8 +33,8 @@ LONG = 20_000
 class RelabeledDataModule(pl.LightningDataModule):
     """Semi-MDP transitions of a data set under the skills of a checkpoint.
 
-    Relabelling runs once: its result is stored under ``cache`` in a file named after the hash of data, skill weights,
-    H and every field of `Relabelling`, so that nothing stale is ever read.
+    Relabelling runs once: its result is stored under ``cache`` in a file named after the hash of data, all that decides
+    the codes of the skills, and every field of `Relabelling`, so that nothing stale is ever read.
 
     Args:
         task: Name of a task (``dds tasks``); null for your own data. After ``setup`` the attribute ``task`` is the
@@ -80,9 +80,7 @@ class RelabeledDataModule(pl.LightningDataModule):
             raise UserError("data.skill is missing: give the skill checkpoint (.ckpt or directory) to relabel with")
         if not 0.0 <= validation_fraction < 1.0:
             raise UserError(f"data.validation_fraction is {validation_fraction}, expected a share in [0, 1)")
-        self.skill = SkillModule.load(skill)
-        if self.task is not None:
-            refuse_other_robot(skill, self.task)
+        self.skill = load_skills(skill, self.task)
         self.observation_dim: int = self.skill.hparams.observation_dim
         self.num_skills: int = self.skill.num_skills
         self.skill_hash = self.skill.fingerprint()
@@ -130,9 +128,12 @@ class RelabeledDataModule(pl.LightningDataModule):
         return relabel_key(self.trajectories, self.skill, self.relabelling.for_task(self.task))
 
     def cache_file(self) -> Path:
-        """File of the relabelled data of exactly these inputs."""
-        name = hashlib.sha256(json.dumps(self.key, sort_keys=True).encode()).hexdigest()[:16]
-        return self._cache_folder() / f"relabelled-{name}.safetensors"
+        """File of the relabelled data of exactly these inputs, whatever the decoder, or that of an earlier version."""
+        codes, whole = halves(self.skill_hash)
+        keys = [json.dumps({**self.key, "skill": skill}, sort_keys=True) for skill in (codes, whole)]
+        names = [hashlib.sha256(key.encode()).hexdigest()[:16] for key in keys]
+        files = [self._cache_folder() / f"relabelled-{name}.safetensors" for name in names]
+        return next((file for file in files if file.exists()), files[0])
 
     def _cache_folder(self) -> Path:
         """The given folder, else beside the checkpoint of a training; nothing is added to a published directory."""

@@ -2,34 +2,35 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from dds_lightning.errors import UserError
-from dds_lightning.saving.checkpoint import load_ckpt, trained_for
-from dds_lightning.saving.published import load_published
+from dds_lightning.saving.checkpoint import load_trained
+from dds_lightning.skill import SkillModule
 from dds_lightning.tasks import Task, known_task
 from dds_lightning.tasks.bodies import body_name
 
 
-def refuse_other_robot(skill: str, task: Task) -> None:
-    """Refuse skills that were trained on another robot of ours; of one that nobody here knows, widths have to do.
+def load_skills(skill: str, task: Task | None) -> SkillModule:
+    """Load a skill model for a task.
 
     Args:
-        skill: `.ckpt` or published directory of a skill model.
-        task: Where its skills are to be used.
+        skill: `.ckpt` or published directory.
+        task: Where its skills are to be used; None for anywhere.
 
     Raises:
-        UserError: The robots differ.
+        UserError: The file cannot be read, or the skills were trained on another robot of ours; of one that nobody here
+            knows, widths have to do.
     """
-    path = Path(skill)
-    name = load_published(path).config.get("task") if path.is_dir() else trained_for(load_ckpt(path))
+    module, name = load_trained(SkillModule, skill, SkillModule.STAGE)
     try:
-        other = known_task(str(name))
+        other = None if task is None or name is None else known_task(name)
     except UserError:
-        return  # nothing says it, or it is a task of somebody's own
+        other = None  # a task of somebody's own
+    if task is None or other is None:
+        return module
     here, there = body_name(task), body_name(other)
     if here != there:
         raise UserError(
             f"data.skill is {skill}, trained on {other.name} ({there}), but data.task is {task.name} ({here}), another "
             "robot: give skills of that robot"
         )
+    return module

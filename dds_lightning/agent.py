@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from dds_lightning.envs.flatten import numbers
 from dds_lightning.errors import UserError
-from dds_lightning.saving.files import short
+from dds_lightning.saving.fingerprint import same, told_apart
 
 if TYPE_CHECKING:
     from dds_lightning.online.parts import RawActions
@@ -104,15 +104,16 @@ class DDSAgent(nn.Module):
         if self.policy is not None:
             theirs: Any = {"num_skills": getattr(self.policy, "num_skills", None), **self.policy.hparams}
             for name in ("num_skills", "observation_dim"):
-                if (mine := getattr(self, name)) != (other := theirs[name]):
-                    told = f"{name} is {mine} in the skill model and {other} in the policy"
+                if (mine := getattr(self, name)) != theirs[name]:
+                    told = f"{name} is {mine} in the skill model and {theirs[name]} in the policy"
                     raise UserError(f"{told}: they do not belong together")
             learnt_with = getattr(self.policy, "skill_hash", None)
-            if learnt_with and learnt_with != (found := self.skill.fingerprint()):
+            if learnt_with and not same(learnt_with, found := self.skill.fingerprint(), self.policy.OF_DECODER):
+                there, here = told_apart(learnt_with, found)
                 raise UserError(
-                    f"the policy was trained on the codes of skill model {short(learnt_with)}, this one is "
-                    f"{short(found)}: they do not belong together; give the skills that the policy was trained with, "
-                    "or train a policy on these with `dds policy fit --data.skill SKILL.ckpt`"
+                    f"the policy was trained on the codes of skill model {there}, this one is {here}: they do not "
+                    "belong together; give the skills that it was trained with, or train a policy on these with "
+                    "`dds policy fit --data.skill SKILL.ckpt`"
                 )
 
     # ---------------------------------------------------------------- acting
@@ -234,8 +235,7 @@ class DDSAgent(nn.Module):
 
     def _pick(self, observations: Tensor, rows: NDArray[np.intp]) -> NDArray[Any]:
         """Codes (m,) or skills (m, D) for the m environments whose skill has run out."""
-        if self.selection == "fixed":
-            assert self.fixed_codes is not None
+        if self.fixed_codes is not None:
             return self.fixed_codes[rows % len(self.fixed_codes)]
         stream = self.generator()
         if self.selection == "random" and self.discrete:

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from dds_lightning.errors import UserError
-from dds_lightning.saving.files import short
+from dds_lightning.saving.fingerprint import same, told_apart
 
 if TYPE_CHECKING:
     from dds_lightning.module import StageModule
@@ -34,8 +34,6 @@ log = logging.getLogger(__name__)
 
 STATISTICS = ("normaliser.", "action_box.")
 """Buffers that hold statistics; loaded together or not at all."""
-FOLLOWER = "follower."
-"""Skills that learn with an online policy; the checkpoint's, or those of data.skill where it has none."""
 
 
 def read(cls: type[StageModule], path: str) -> StageModule:
@@ -70,7 +68,8 @@ def start_from(module: StageModule, path: str) -> None:
         theirs["bottleneck.ema_sum"] = theirs["bottleneck.vectors"].clone()
         theirs["bottleneck.ema_count"] = torch.ones_like(ours["bottleneck.ema_count"])
     left = {name for name in ours if name in module.OF_DATA}
-    left |= {name for name in ours if name.startswith(FOLLOWER) and name not in theirs}
+    optional = tuple(f"{name}." for name in module.OPTIONAL)
+    left |= {name for name in ours if name.startswith(optional) and name not in theirs}
     shapes = {name: value.shape for name, value in theirs.items()}
     misfits = [name for name, value in ours.items() if name not in left and shapes.get(name) != value.shape]
     if module.hparams.get("refit_normaliser") or any(name.startswith(STATISTICS) for name in misfits):
@@ -123,10 +122,11 @@ def refuse_other_skills(module: StageModule, source: StageModule, path: str) -> 
     """Refuse a policy that chose among the codes of another skill model: there the same numbers mean other skills."""
     # What a checkpoint's own decoder learnt belongs to it; where one is about to learn, the data say what it begins as.
     there, here = source.skill_hash, module.hparams.get("skill_hash")
-    if there and here and there != here:
+    if there and here and not same(there, here, module.OF_DECODER):
+        was, found = told_apart(there, here)
         raise UserError(
-            f"data.skill is skill model {short(here)}, but model.init_from {path} was trained on the codes of skill "
-            f"model {short(there)}: give that one as data.skill, or start anew"
+            f"data.skill is skill model {found}, but model.init_from {path} was trained on the codes of skill model "
+            f"{was}: give that one as data.skill, or start anew"
         )
 
 

@@ -1,6 +1,5 @@
 """What the modules of all training stages share: checked settings, trainable parts, and their optimiser."""
 
-import hashlib
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -19,6 +18,7 @@ from dds_lightning.nn.embedding import EmbeddingMixin
 from dds_lightning.nn.normaliser import ActionBox
 from dds_lightning.nn.ranges import Rule, network_rules
 from dds_lightning.saving.checkpoint import STAGE_KEY, load_module
+from dds_lightning.saving.fingerprint import digest
 
 Schedule = Literal["constant", "cosine"]
 
@@ -42,6 +42,10 @@ class StageModule(EmbeddingMixin, pl.LightningModule):
     """What `predict_step` returns one of for each row."""
     OF_DATA: ClassVar[tuple[str, ...]] = ()
     """Buffers that always come from the data."""
+    OF_DECODER: ClassVar[bool] = False
+    """Whether it learnt by acting, so that it belongs to the skills' decoder and not only to their codes."""
+    OPTIONAL: ClassVar[tuple[str, ...]] = ()
+    """Submodules that a checkpoint to start from may lack: then they begin as the data say."""
 
     action_box: ActionBox  # of modules that see actions
     init_from: str | None = None  # the checkpoint this module started from, in this process
@@ -269,11 +273,7 @@ class StageModule(EmbeddingMixin, pl.LightningModule):
 
     def fingerprint(self) -> str:
         """SHA-256 of all weights and buffers with their names: the same for the same model, wherever it is stored."""
-        digest = hashlib.sha256()
-        for name, tensor in sorted(self.state_dict().items()):
-            digest.update(name.encode())
-            digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-        return digest.hexdigest()
+        return digest(self.state_dict())
 
     @classmethod
     def starting_from(cls, path: str | Path, **settings: Any) -> Self:

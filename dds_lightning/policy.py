@@ -87,7 +87,7 @@ class PolicyModule(StageModule):
         lr_schedule: ``constant`` (the paper) or ``cosine`` decay to zero at ``max_steps``.
         warmup_steps: Steps of linear warm-up.
         init_from: ``.ckpt`` or published directory whose weights to start from (`dds_lightning.finetune`), for new
-            rewards or a new goal; ``data.skill`` must be the skill model that this policy was trained with.
+            rewards or a new goal; ``data.skill`` must have the codes that this policy was trained with.
         trainable: ``all``, ``critic`` (V and Q) or ``actor``; the rest does not change by a bit.
         lr_scale: Factor on ``lr`` by part, such as ``{actor: 0.1}``; 1 for a part that is not named.
         refit_normaliser: With ``init_from``, take the statistics of the new data, not the checkpoint's.

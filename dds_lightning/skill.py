@@ -26,6 +26,7 @@ from dds_lightning.nn.gaussian import GaussianBottleneck
 from dds_lightning.nn.normaliser import ActionBox, Normaliser
 from dds_lightning.nn.settled import SettledCodes
 from dds_lightning.nn.usage import CodebookUsage
+from dds_lightning.saving.fingerprint import of_skills
 
 START_BATCHES = 64
 """Batches whose encodings start the codebook by k-means."""
@@ -197,9 +198,7 @@ class SkillModule(StageModule):
             self.normaliser(observations).flatten(0, 1),  # (B H, O)
             skill.vectors.repeat_interleave(actions.shape[1], dim=0),  # (B H, D)
         )
-        total = error.mean()
-        if self.hparams.reconstruction == "sum":
-            total = total * actions[0].numel()
+        total = error.mean() * (actions[0].numel() if self.hparams.reconstruction == "sum" else 1)
         terms = {"denoising": total.detach()}
         for name, term in skill.terms.items():
             total = total + term.weight * term.value
@@ -291,19 +290,17 @@ class SkillModule(StageModule):
         """Restart dead codes from this batch until the codebook has to settle, and freeze them in time."""
         h = self.hparams
         self._freeze_codes(step)
-        if h.restart_threshold <= 0 or step % h.restart_every or "codebook" not in self.trained_parts:
-            return
         last = h.freeze_codes_after or self.trainer.max_steps
-        if last > 0 and step > h.restart_until * last:
+        late = last > 0 and step > h.restart_until * last
+        if late or h.restart_threshold <= 0 or step % h.restart_every or "codebook" not in self.trained_parts:
             return
         generator = torch.Generator().manual_seed(step)
         moved = self.bottleneck.revive(lambda: self._encodings_of([self._batch]), h.restart_threshold, generator)
         optimizer: Any = self.optimizers()
         for parameter, rows in zip(moved, self.agree(self.bottleneck, list(moved.values())), strict=True):
             state = optimizer.state.get(parameter, {})
-            for name in ("exp_avg", "exp_avg_sq"):  # the moments belonged to the code that died
-                if name in state:
-                    state[name][rows] = 0.0
+            for name in state.keys() & {"exp_avg", "exp_avg_sq"}:  # the moments belonged to the code that died
+                state[name][rows] = 0.0
 
     def evaluate(self, batch: Batch, stage: str) -> None:
         """Log the loss, and update reconstruction error in action units (by sampling) and codebook usage."""
@@ -333,9 +330,8 @@ class SkillModule(StageModule):
         self._log_epoch("test")
 
     def _log_epoch(self, stage: str) -> None:
-        log = {"reconstruction_rmse": self.reconstruction_rmse.compute().sqrt()}
-        if self.discrete:
-            log.update(self.usage.compute())
+        usage = self.usage.compute() if self.discrete else {}
+        log = {"reconstruction_rmse": self.reconstruction_rmse.compute().sqrt(), **usage}
         self.log_dict({f"{stage}/{name}": value for name, value in log.items()}, prog_bar=True, sync_dist=True)
 
     def on_fit_end(self) -> None:
@@ -344,6 +340,10 @@ class SkillModule(StageModule):
         if 2 * used < self.num_skills:
             remedy = "Keep codebook_init=kmeans and restart_threshold above 0, lower lr, or ask for fewer skills"
             warnings.warn(f"only {used} of {self.num_skills} codes are in use. {remedy}", stacklevel=1)
+
+    def fingerprint(self) -> str:
+        """Of the codes, and of all weights: see `dds_lightning.saving.fingerprint`."""
+        return of_skills(self.state_dict(), self.hparams)
 
     def predict_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """Codes (B,) of a batch of segments."""

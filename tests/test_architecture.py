@@ -30,7 +30,7 @@ ROOMS = {
     # the method, to be read in this order
     "dds_lightning.finetune": "errors saving",
     "dds_lightning.module": "errors finetune nn saving",
-    "dds_lightning.skill": "errors module nn",
+    "dds_lightning.skill": "errors module nn saving",
     "dds_lightning.policy": "errors losses module nn",
     "dds_lightning.online": "envs errors losses module nn policy saving skill",
     "dds_lightning.agent": "envs errors online policy saving skill",
@@ -52,7 +52,7 @@ ROOMS = {
     "datamodules.listing": "errors tasks datamodules.sources datamodules.storage datamodules.trajectories",
     "datamodules.partial_codes": "errors saving",
     "datamodules.relabelling": "envs errors tasks",
-    "datamodules.robots": "errors saving tasks",
+    "datamodules.robots": "errors saving skill tasks",
     "datamodules.relabel": "console envs errors saving skill datamodules.partial_codes datamodules.relabelling "
     "datamodules.trajectories",
     "datamodules.segments": "errors nn tasks datamodules.collect datamodules.loader datamodules.sources "

@@ -7,7 +7,8 @@ The decoder repeats what was done under a code where that turned out better than
  w |predicted noise - noise|^2       of one of its steps (equation 5)
 ```
 
-Codes keep their meaning: encoder and codebook stand still, and the critics see what a code leads to now.
+Codes keep their meaning: encoder and codebook stand still, and the critics see what a code leads to now. The policy
+acts with this decoder alone: an agent that joins it to another is refused (`dds_lightning.saving.fingerprint`).
 """
 
 from __future__ import annotations

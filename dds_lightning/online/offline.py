@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dds_lightning.errors import UserError
 from dds_lightning.policy import PolicyModule
-from dds_lightning.saving.files import short
+from dds_lightning.saving.fingerprint import same, told_apart
 
 SHAPE = ("observation_dim", "hidden_dims", "fourier_features", "fourier_seen", "layer_norm")
 LESSONS, LESSON_SIZE, LESSON_RATE = 2_000, 512, 1e-3
@@ -48,10 +48,11 @@ def refuse_other_policy(policy: PolicyModule, path: str, skill_hash: str | None,
         UserError: It chooses among the codes of another model.
     """
     there = policy.hparams
-    if there.skill_hash and skill_hash and there.skill_hash != skill_hash:
+    if there.skill_hash and skill_hash and not same(there.skill_hash, skill_hash, policy.OF_DECODER):
+        was, found = told_apart(there.skill_hash, skill_hash)
         raise UserError(
-            f"model.offline: {path} was trained on skill model {short(there.skill_hash)}, data.skill is "
-            f"{short(skill_hash)}: give the skill model that it was trained on"
+            f"model.offline: {path} was trained on skill model {was}, data.skill is {found}: give the skill model that "
+            "it was trained on"
         )
     if there.num_skills != choices:
         raise UserError(

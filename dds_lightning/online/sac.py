@@ -85,11 +85,10 @@ class SACModule(StageModule):
 
     STAGE = "online"
     PREDICTION = "choice"
+    OF_DECODER = True
+    OPTIONAL = ("follower",)  # which then begins as data.skill
     PARTS: ClassVar = {"critic": ("critic", "target_critic"), "actor": ("actor",)}
-    SHAPE = (
-        *("space", "choices", "hidden_dims", "layer_norm", *FOURIER),
-        "critics",
-    )
+    SHAPE = ("space", "choices", "hidden_dims", "layer_norm", "critics", *FOURIER)
     support_mask: Tensor
     target_entropy: Tensor
 
@@ -165,7 +164,7 @@ class SACModule(StageModule):
 
     @property
     def skill_hash(self) -> str | None:
-        """Fingerprint of the skill model whose skills it chooses, as their decoder is now."""
+        """Fingerprint of the skill model whose skills it chooses, as their decoder is now: it belongs to that one."""
         return super().skill_hash if self.follower is None else self.follower.skill.fingerprint()
 
     @property

@@ -26,7 +26,7 @@ from dds_lightning.pipeline.evaluating import publish_played
 from dds_lightning.policy import PolicyModule
 from dds_lightning.saving.arrays import read_npy
 from dds_lightning.saving.checkpoint import load_ckpt
-from dds_lightning.saving.files import sha256
+from dds_lightning.saving.published import weights_hash
 from dds_lightning.saving.run_directory import Done, RunDirectory, locked
 from dds_lightning.saving.untrusted import read_csv
 from dds_lightning.tasks import get_task
@@ -171,17 +171,8 @@ def _settings(config: Facts) -> dict[str, Any]:
         "model": {name: value for name, value in config["model"].items() if name != "offline"},
         "data": data,
         "steps": config["trainer"]["max_steps"],
-        "files": {name: _content(place) for name, place in places.items() if place},
+        "files": {name: weights_hash(Path(place)) for name, place in places.items() if place},
     }
-
-
-def _content(path: str | None) -> str | None:
-    """Hash of a checkpoint's weights."""
-    if path is None:
-        return None
-    place = Path(path)
-    file = place / "model.safetensors" if place.is_dir() else place
-    return sha256(file) if file.is_file() else None
 
 
 def _do(

@@ -17,7 +17,7 @@ from dds_lightning.pipeline.beside import Beside, Work
 from dds_lightning.pipeline.child import Lines, await_turn
 from dds_lightning.pipeline.context import Run
 from dds_lightning.pipeline.settings import RunSettings
-from dds_lightning.pipeline.steps import STEPS, Step
+from dds_lightning.pipeline.steps import STEPS, Step, reading_starts
 from dds_lightning.saving.run_directory import MARKER, Done, RunDirectory, duration, locked, read_marker
 from dds_lightning.saving.untrusted import parsing
 from dds_lightning.study.run_task import keep_task
@@ -45,7 +45,7 @@ def _do_steps(run: Run) -> None:
     directory, told = (RunDirectory(run.out, console, run.wanted.fresh) for console in (run.console, Lines()))
     names = list(STEPS)
     last = names.index(run.wanted.until) if run.wanted.until in names else len(names)
-    steps = [STEPS[name] for name in names[: last + 1]]
+    steps = [reading_starts(STEPS[name], run) for name in names[: last + 1]]
     parts = [part for step in steps for part in (step.ahead, step) if part is not None and part.beside]
 
     # Here and not when they begin: parsers and filters of warnings are not made for two threads.

@@ -14,6 +14,9 @@ from dds_lightning.configs import RUN_DEFAULTS, known_as, run_defaults
 from dds_lightning.console.reports import Report
 from dds_lightning.errors import UserError
 from dds_lightning.pipeline.trial import refuse_settings
+from dds_lightning.saving.files import expand
+from dds_lightning.saving.places import refuse_no_checkpoint
+from dds_lightning.saving.published import weights_hash
 from dds_lightning.tasks import Task, get_task, is_own
 from dds_lightning.training.alone import run_alone
 from dds_lightning.training.monitors import refuse_late_validation
@@ -108,6 +111,10 @@ class Trainings:
             except UserError as error:
                 raise UserError(f"{stage}: {error}") from error
         refuse_settings(self._parsed, task)
+        for stage in self._parsed:
+            for name, path in self.starts(stage).items():
+                if not self.is_own(path):
+                    refuse_no_checkpoint(path, f"{stage}: model.{name}: ")
         self._settle_interval()
         if wanted.data is None:
             self.refuse_late_validations(wanted.data_steps + task.max_episode_steps)
@@ -232,19 +239,32 @@ class Trainings:
             chosen["average"] = config["average"]
         if config["stop"]["when"] != "steps":
             chosen["stop"] = config["stop"]
+        starts = {name: path for name, path in self.starts(stage).items() if not self.is_own(path)}
+        if starts:
+            chosen["starts"] = {name: weights_hash(path) for name, path in starts.items()}
         return {"seed": config["seed_everything"], **chosen}
+
+    def starts(self, stage: str) -> dict[str, Path]:
+        """The checkpoints from whose weights a training starts, by the setting that names them."""
+        model = self._parsed[stage].settings.model
+        return {name: expand(model[name]) for name in ("init_from", "offline") if model.get(name)}
+
+    def is_own(self, path: Path) -> bool:
+        """Whether this run makes a file: what holds it may not be there yet, or be made anew."""
+        return path.resolve().is_relative_to(self.wanted.out.resolve())
 
     def former_settings(self, stage: str) -> dict[str, Any]:
         """`cache_key_settings` as version 0.1.0 wrote them, so that what it finished is still found done.
 
-        It trained the clone without a configuration, and chose the policy's best checkpoint by sampled codes with the
-        decoder's own noise, however the run acts.
+        It did not look into the checkpoints that a training starts from, trained the clone without a configuration, and
+        chose the policy's best checkpoint by sampled codes with the decoder's own noise, however the run acts.
         """
         if stage == "clone":
             wanted = self.wanted
             asked = {"arguments": list(asked)} if (asked := wanted.stages.get(stage)) else {}
             return {"task": self.task.name, "seed": wanted.seed, "steps": wanted.clone_steps, **asked}
         settings = self.cache_key_settings(stage)
+        settings.pop("starts", None)
         for callback in settings["trainer"]["callbacks"] or [] if stage == "policy" and self.evaluate_every else []:
             if callback["init_args"].get("seed") == self.wanted.seed + 1:
                 callback["init_args"] |= {"selections": ["sample"], "temperature": 1.0, "noise_scale": None}

@@ -12,7 +12,7 @@ on one core, others train the clone and let everyone play who needs no policy (`
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -275,6 +275,15 @@ STEPS: dict[str, Step] = {
     )
 }
 """Name -> step, each after those that it reads."""
+
+
+def reading_starts(step: Step, run: Run) -> Step:
+    """The step as it is in a run: learning online also reads the step that makes the policy from which it starts."""
+    policy = run.trainings.starts("online").get("offline") if step.name == "online" else None
+    if policy is None or not run.trainings.is_own(policy):
+        return step
+    of_policy = policy.resolve().is_relative_to((run.out / "policy").resolve())
+    return replace(step, reads=(*step.reads, "policy" if of_policy else "evaluate"))  # which publishes the agent
 
 
 def every_step() -> Iterator[Step]:

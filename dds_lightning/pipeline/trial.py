@@ -33,10 +33,13 @@ def refuse_settings(parsed: Mapping[str, StageCLI], task: Task) -> None:
         settings = cli.settings.as_dict()
         try:
             _try_data(cli, settings["data"])
-            raw = {"space": "raw", "choices": task.action_dim, "skill_settings": None}
-            found = {**sizes, **raw} if settings["data"].get("actions") == "raw" else sizes
+            if settings["data"].get("actions") == "raw":
+                raise UserError(
+                    "data.actions is raw, expected skills: a run learns online over the skills that it has trained; "
+                    f"for raw actions, which need none, use `dds online fit --data.task={task.name} --data.actions=raw`"
+                )
             with torch.device("meta"):  # shapes without numbers
-                cli.stage.module_class()(**_chosen(settings["model"]), **{one: found[one] for one in cli.stage.links})
+                cli.stage.module_class()(**_chosen(settings["model"]), **{one: sizes[one] for one in cli.stage.links})
         except UserError as error:
             raise UserError(f"{name}: {error}") from error
 

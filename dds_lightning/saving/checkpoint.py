@@ -229,11 +229,18 @@ def load_module(cls: type[M], path: str | os.PathLike[str], part: str) -> M:
     Raises:
         UserError: the file is missing, damaged, or of another kind of module.
     """
+    return load_trained(cls, path, part)[0]
+
+
+def load_trained(cls: type[M], path: str | os.PathLike[str], part: str) -> tuple[M, str | None]:
+    """As `load_module`, with the name of the task that it was trained for; None where nothing says it."""
     path = Path(path)
     if path.is_dir() or not path.suffix:
-        return load_published(path).module(cls, part)
+        published = load_published(path)
+        task = published.config.get("task")
+        return published.module(cls, part), task if isinstance(task, str) else None
     checkpoint = load_ckpt(path)
     if (saved := stage_of(checkpoint)) not in (None, part):
         raise UserError(f"{path} is a checkpoint of stage {saved}, expected {part}")
     settings = dict(checkpoint.get("hyper_parameters") or {})
-    return build_module(cls, settings, checkpoint["state_dict"], str(path))
+    return build_module(cls, settings, checkpoint["state_dict"], str(path)), trained_for(checkpoint)

@@ -30,6 +30,7 @@ from dds_lightning.errors import UserError
 from dds_lightning.saving.arrays import read_tensors
 from dds_lightning.saving.build import build_module
 from dds_lightning.saving.files import expand, folder_written_whole, mend_folder, neighbours, refuse_newer, sha256
+from dds_lightning.saving.fingerprint import completed
 from dds_lightning.saving.untrusted import TEXT, mapping, read_json, read_text, read_yaml, regular_file
 
 FORMAT_VERSION = 1
@@ -71,8 +72,11 @@ class Published:
         """
         if not isinstance(self.config.get(part), dict):
             raise UserError(f"{self.directory / CONFIG} describes no '{part}'; it has {', '.join(self.config)}")
-        state = {key.removeprefix(f"{part}."): value for key, value in self.state.items() if key.startswith(f"{part}.")}
-        return build_module(cls, self.config[part], state, f"{self.directory} ({part})")
+        settings = completed(self.config[part], self._weights("skill"), self.config.get("skill"))
+        return build_module(cls, settings, self._weights(part), f"{self.directory} ({part})")
+
+    def _weights(self, part: str) -> dict[str, Tensor]:
+        return {key.removeprefix(f"{part}."): value for key, value in self.state.items() if key.startswith(f"{part}.")}
 
     def acting(self) -> dict[str, Any]:
         """How the agent acts: arguments of `DDSAgent` beside its modules.
@@ -182,6 +186,12 @@ def load_published(directory: str | os.PathLike[str]) -> Published:
     refuse_newer(directory / CONFIG, config.get("format_version"), FORMAT_VERSION)
     state, _ = read_tensors(directory / WEIGHTS, largest=LARGEST, root=root)
     return Published(directory, state, config, mapping(read_json(directory / METRICS), directory / METRICS))
+
+
+def weights_hash(path: Path) -> str | None:
+    """Hash of what a checkpoint holds, a file or a published directory, wherever it lies; None if it is not there."""
+    file = path / WEIGHTS if path.is_dir() else path
+    return sha256(file) if file.is_file() else None
 
 
 def _root(directory: Path) -> Path:

@@ -26,7 +26,7 @@ from dds_lightning.console.arguments import as_lists, list_options, without_file
 from dds_lightning.console.refusals import as_user_errors, sentence
 from dds_lightning.console.reports import Report, table
 from dds_lightning.errors import UserError, refuse_seed
-from dds_lightning.saving.files import short
+from dds_lightning.saving.fingerprint import same, told_apart
 from dds_lightning.saving.untrusted import mapping, parse_yaml
 from dds_lightning.tasks.own import is_address
 from dds_lightning.training.fit import advice_on_memory, fit, quieten
@@ -210,17 +210,21 @@ class StageCLI(LightningCLI):
         trained = (self.checkpoint or {}).get("hyper_parameters", {})
         path = self.settings.get("ckpt_path")
         for name in self.stage.links:
-            if trained.get(name) in (None, self.model.hparams[name]):
+            was, found = trained.get(name), self.model.hparams[name]
+            if was in (None, found):
                 continue
-            if name == "skill_hash":
+            if name == "skill_hash" and found is not None:
+                if same(was, found, self.model.OF_DECODER):
+                    continue
+                there, here = told_apart(was, found)
                 raise UserError(
-                    f"checkpoint {path} was trained on the codes of skill model {short(trained[name])}, data.skill "
-                    f"{self.datamodule.hparams.skill} is skill model {short(self.model.hparams[name])}: give the "
-                    "skill checkpoint that this policy learnt with"
+                    f"checkpoint {path} was trained on the codes of skill model {there}, data.skill "
+                    f"{self.datamodule.hparams.skill} is skill model {here}: give the skill checkpoint that this "
+                    "policy learnt with"
                 )
             raise UserError(
-                f"checkpoint {path} was trained with {name} {trained[name]}, the data have "
-                f"{self.model.hparams[name]}: use a checkpoint and data of the same task"
+                f"checkpoint {path} was trained with {name} {was}, the data have {found}: use a checkpoint and data of "
+                "the same task"
             )
         return self
 

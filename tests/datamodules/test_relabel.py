@@ -1,5 +1,6 @@
 """Relabelling: rewards and ends worked out by hand, the cache refused when it does not match."""
 
+import copy
 import hashlib
 import json
 import warnings
@@ -22,6 +23,7 @@ from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError
 from dds_lightning.nn.precision import Choice
 from dds_lightning.policy import PolicyModule
+from dds_lightning.saving.fingerprint import halves
 from dds_lightning.skill import SkillModule
 from dds_lightning.tasks import get_task
 from tests.modules import fit
@@ -396,8 +398,32 @@ def test_the_name_of_a_cached_file_is_that_of_earlier_versions(trajectories, ski
     key = {"data": trajectories.fingerprint(), "skill": skill.fingerprint(), "horizon": 3, "gamma": 0.9}
     key |= {"discount": "per_skill", "stride": 1, "reward_scale": 1.0, "reward_shift": 0.0}
     assert json.dumps(made.key) == json.dumps(key)
-    name = hashlib.sha256(json.dumps(key, sort_keys=True).encode()).hexdigest()[:16]
-    assert made.cache_file().name == f"relabelled-{name}.safetensors"
+    codes, whole = (
+        tmp_path / f"relabelled-{hashlib.sha256(text.encode()).hexdigest()[:16]}.safetensors"
+        for text in (json.dumps({**key, "skill": half}, sort_keys=True) for half in halves(skill.fingerprint()))
+    )
+    assert made.cache_file() == codes
+    relabel(trajectories, skill, gamma=0.9).save(whole, {**key, "skill": halves(skill.fingerprint())[1]})
+    assert made.cache_file() == whole  # as version 0.1.0 called it
+    made.setup()
+    assert not codes.exists()
+
+
+def test_relabelled_data_stay_when_the_decoder_was_tuned(trajectories, skill, tmp_path):
+    made = module(trajectories, skill, tmp_path)
+    made.prepare_data()
+    made.setup()
+    tuned, moved = copy.deepcopy(skill), copy.deepcopy(skill)
+    with torch.no_grad():
+        next(tuned.decoder.parameters()).add_(0.1)
+        moved.bottleneck.vectors.add_(0.1)
+    again = module(trajectories, tuned, tmp_path)
+    assert again.cache_file() == made.cache_file()
+    again.setup()
+    assert torch.equal(again.transitions.codes, made.transitions.codes)
+    assert not module(trajectories, moved, tmp_path).cache_file().exists()
+    with pytest.raises(UserError, match=r"relabelled with other inputs \(skill"):
+        Relabelled.load(made.cache_file(), relabel_key(trajectories, moved))
 
 
 def timed_out(rewards: list[list[float]]) -> Trajectories:

@@ -95,7 +95,19 @@ def test_a_policy_knows_the_skills_that_it_learnt_with(made):
     first, second = fingerprints(made)
     assert first != second
     assert PolicyModule.load(made / "policy" / "last.ckpt").hparams.skill_hash == first
-    assert re.fullmatch("[0-9a-f]{64}", first)
+    assert re.fullmatch("[0-9a-f]{64}-[0-9a-f]{64}", first)
+
+
+def test_a_policy_stays_with_skills_whose_decoder_was_tuned(capsys, made, data, tmp_path):
+    start = f"--model.init_from={made}/skill/last.ckpt"
+    tuned = skill_of(data, tmp_path / "tuned", 3, start, "--model.trainable=[decoder]", "--seed_everything=3")
+    before, after = (SkillModule.load(path).decoder.state_dict() for path in (made / "skill" / "last.ckpt", tuned))
+    assert any(not torch.equal(value, after[name]) for name, value in before.items())
+    given = ["--skill", tuned, "--policy", made / "policy" / "last.ckpt"]
+    assert call("evaluate", "-", *given, "--episodes=1", "--workers=0") == 0
+    goes_on = [*data, *QUIET, "--trainer.max_steps=6", f"--data.skill={tuned}", "--data.cache=.", "--data.gamma=0.9"]
+    goes_on += [f"--ckpt_path={made}/policy/last.ckpt", "--checkpoint.dirpath=."]
+    assert call("policy", "fit", *goes_on) == 0, capsys.readouterr().err
 
 
 def test_a_fingerprint_is_of_every_bit_and_not_of_the_file(made, tmp_path):
