@@ -100,7 +100,7 @@ WRONG = {
     "lost": "gives an observation with nan in column 1, expected finite numbers: end the episode",
     "nan": "pays a reward of nan, expected a finite number",
     "no reward": "pays a reward of None, expected a finite number",
-    "old step": r"Buoy does not .* interface .*got 4\)\): expected step\(action\) to return five values: observation, reward,",
+    "old step": r"Buoy does not .* interface .*got 4\)\): expected step\(action\) to return five values:",
     "old reset": r"\(it returns a ndarray\): expected reset\(seed=..., options=...\) to return two values",
     "old seed": r"got an unexpected keyword argument 'seed'\): expected reset\(seed=",
 }
