@@ -569,7 +569,7 @@ print(f"in the dock after {ticks / 10:g} s" if docked else "not in the dock afte
 
 # %%
 place = RUNS / "cart-agent"
-status = dds(f"publish - {place} --skill {RUNS}/skill.ckpt --policy {RUNS}/policy.ckpt")
+status = dds(f"publish - {place} --replace --skill {RUNS}/skill.ckpt --policy {RUNS}/policy.ckpt")
 
 # %%
 again = DDSAgent.load(place, seed=7)

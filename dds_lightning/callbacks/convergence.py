@@ -12,6 +12,10 @@ from lightning.pytorch.callbacks import Callback
 from dds_lightning.errors import UserError
 from dds_lightning.module import planned_steps
 
+OVERFIT = 0.2
+"""Rise of held-out loss above its lowest level that is no accident: validations draw the same noise every time, and
+where data suffice their losses wander by a few per cent."""
+
 
 class Convergence(Callback):
     """Stop when held-out loss has levelled off; `trainer.max_steps` is the budget in any case.
@@ -31,6 +35,7 @@ class Convergence(Callback):
 
     Attributes:
         history: (step, loss) of every validation at the full learning rate.
+        trained: The same loss of training batches at these steps, where it is logged.
         ends: Step at which a training ends that has levelled off; None until then.
 
     Raises:
@@ -59,6 +64,7 @@ class Convergence(Callback):
         self.when, self.monitor, self.min_steps, self.tolerance = when, monitor, min_steps, tolerance
         self.decay = decay
         self.history: list[tuple[int, float]] = []
+        self.trained: list[tuple[int, float]] = []
         self.ends: int | None = None
         self._budget = -1  # steps at which the training ends in any case, -1 for no end
         self._decay = decay  # 0 where the learning rate has a schedule of its own
@@ -108,6 +114,8 @@ class Convergence(Callback):
         if self._share(step) < 1.0:
             return
         self.history.append((step, float(trainer.callback_metrics[self.monitor])))
+        if (same := self.monitor.replace("val/", "train/", 1)) != self.monitor and same in trainer.callback_metrics:
+            self.trained.append((step, float(trainer.callback_metrics[same])))
         if self.when == "converged" and self.converged:
             self.ends = step + min(self._decay, step // 4)
             trainer.should_stop = self.ends <= step
@@ -119,7 +127,13 @@ class Convergence(Callback):
         return self.history[-1][0] >= self.min_steps and not math.isnan(fall) and fall < self.tolerance
 
     def remark(self) -> str | None:
-        """Say by how much held-out loss would still fall; None where it has levelled off, or nothing is known."""
+        """Say by how much held-out loss would still fall, or has risen; None where it has levelled off."""
+        rise, lowest = overfit(self.history, self.trained)
+        if rise > OVERFIT:
+            return (
+                f"{self.monitor} has risen by {100 * rise:.0f} % since step {lowest:,} while training loss fell: the "
+                "data are learnt by heart; collect more of them, or lower --trainer.max_steps"
+            )
         fall = expected_fall(self.history, self.MORE, self.FEWEST) if self.history else math.nan
         if math.isnan(fall) or fall < self.tolerance:
             return None
@@ -130,11 +144,13 @@ class Convergence(Callback):
 
     def state_dict(self) -> dict[str, Any]:
         """The curve so far, and the end that is near."""
-        return {"history": [list(point) for point in self.history], "ends": self.ends, "rates": self._rates}
+        history, trained = ([list(point) for point in points] for points in (self.history, self.trained))
+        return {"history": history, "trained": trained, "ends": self.ends, "rates": self._rates}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on from `state_dict`."""
         self.history = [(int(step), float(loss)) for step, loss in state_dict["history"]]
+        self.trained = [(int(step), float(loss)) for step, loss in state_dict.get("trained", [])]
         ends, rates = state_dict.get("ends"), state_dict.get("rates")
         self.ends = None if ends is None else int(ends)
         self._rates = None if rates is None else [float(rate) for rate in rates]
@@ -157,3 +173,24 @@ def expected_fall(history: list[tuple[int, float]], more: float = 1.25, fewest: 
     steps, losses = np.log(points).T
     slope = np.polyfit(steps, losses, 1)[0]
     return 1.0 - more ** float(slope)
+
+
+def overfit(history: list[tuple[int, float]], trained: list[tuple[int, float]], over: int = 3) -> tuple[float, int]:
+    """By which share held-out loss has risen above its lowest level while training loss fell, and since which step.
+
+    Args:
+        history: (step, held-out loss) of every validation, ascending.
+        trained: (step, training loss) of the same.
+        over: Validations that a level is the mean of, for single ones are chance.
+
+    Returns:
+        The share and the step; (0, 0) where training loss did not fall, or nothing is known.
+    """
+    if len(history) < 2 * over or [step for step, _ in history] != [step for step, _ in trained]:
+        return 0.0, 0
+    window = np.ones(over) / over
+    held_out, learnt = (np.convolve([loss for _, loss in points], window, "valid") for points in (history, trained))
+    lowest = int(np.argmin(held_out))
+    if not (held_out[lowest] > 0 and learnt[-1] < learnt[lowest]):
+        return 0.0, 0
+    return float(held_out[-1] / held_out[lowest] - 1.0), history[lowest + over // 2][0]

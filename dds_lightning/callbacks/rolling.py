@@ -50,7 +50,11 @@ class RollingCheckpoint(Checkpoint):
         """Decide where the file goes."""
         if stage == "fit":
             self.path = Path(trainer.strategy.broadcast(str(self.place(trainer))))
-            self.path.parent.mkdir(parents=True, exist_ok=True)  # a place that cannot be written shows before training
+            try:  # a place that cannot be written shows before training
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+            except (FileExistsError, NotADirectoryError):
+                folder = self.path.parent
+                raise UserError(f"checkpoint.dirpath is {folder}, but there is a file: give a folder") from None
 
     def place(self, trainer: pl.Trainer) -> Path:
         """Where the file of this launch goes."""

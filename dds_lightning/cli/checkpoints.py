@@ -18,6 +18,7 @@ def publish(
     task: str | None = None,
     card: str | None = None,
     public: bool = False,
+    replace: bool = False,
 ) -> Report:
     """Publish an agent as a directory that others can load and trust, or push it to the Hugging Face Hub.
 
@@ -26,19 +27,20 @@ def publish(
 
     Args:
         run: A run of `dds run`, or a published directory; "-" with --skill.
-        place: A new directory, or hf:OWNER/NAME.
+        place: A directory, or hf:OWNER/NAME; another agent that is there stays, see --replace.
         skill: Skill checkpoint (.ckpt) instead of a run.
         policy: Policy checkpoint (.ckpt) to go with it, of `dds policy fit` or `dds online fit`; one over raw actions
             comes without --skill.
         task: Name of the task to keep with it; without it the one that the run or the checkpoints were trained for.
         card: A text file for README.md; without it the run's card.
         public: Make a new repository on the Hub public.
+        replace: Replace another agent that was published in that directory.
     """
     if run != "-" and skill is None and policy is None:
         refuse_no_folder(run)
     from dds_lightning.agent import DDSAgent
     from dds_lightning.saving.hub import push
-    from dds_lightning.saving.published import CARD, load_published
+    from dds_lightning.saving.published import CARD, load_published, refuse_another
     from dds_lightning.saving.untrusted import read_text
     from dds_lightning.sharing.verify import verify_published
     from dds_lightning.study.card import with_diagnosis
@@ -74,6 +76,8 @@ def publish(
             saved = agent.save(Path(folder) / "agent", metrics=metrics, card=text, **about)
             facts = {**verify_published(saved), "directory": push(saved, place, private=not public)}
     else:
+        if not replace:
+            refuse_another(place, agent.state_dict())
         facts = verify_published(agent.save(place, metrics=metrics, card=text, **about))
     return Report(facts, [pairs(facts.items()), f'load it with DDSAgent.load("{place}")'])
 

@@ -20,7 +20,7 @@ def run(
     task: str,
     out: str | None = None,
     data: str | None = None,
-    seed: int = 0,
+    seed: int | None = None,
     preset: str | None = None,
     data_steps: int | None = None,
     clone_steps: int | None = None,
@@ -40,8 +40,9 @@ def run(
     """Do everything for one task: data, skills, relabelling, policy, baseline, evaluation, report.
 
     Finished stages are not repeated: call it again after an interruption and it continues where it stopped;
-    change a setting and the stages that depend on it are done again. Every setting of a training stage can be given as
-    --STAGE.KEY=VALUE, for example --skill.trainer.max_steps=500 --policy.model.alpha=5.
+    change a setting and the stages that depend on it are done again; settings left out are those of the earlier call.
+    Every setting of a training stage can be given as --STAGE.KEY=VALUE, for example --skill.trainer.max_steps=500
+    --policy.model.alpha=5.
 
     A task with several physics variants (`dds tasks NAME`) is played in the one in which the data were recorded.
 
@@ -58,7 +59,7 @@ def run(
         out: Folder of the run; without it runs/TASK.
         data: Your data, local:DIR, minari:ID, d4rl:FILE or arrays:DIR; without it data are collected in the
             environment.
-        seed: Seed of everything random: data, both trainings and the evaluation.
+        seed: Seed of everything random: data, both trainings and the evaluation; without it 0.
         preset: Packaged configurations (antmaze, kitchen, locomotion, pointmaze, paper), or a folder with skill.yaml,
             policy.yaml and, if you like, run.yaml (data_steps, clone_steps, episodes_per_skill, selection, temperature,
             noise_scale); without it the task family's.
@@ -85,29 +86,37 @@ def run(
     from dds_lightning.tasks import get_task
 
     run_defaults(preset or get_task(task).family)  # what is misspelt is told before anything heavy is imported
+    from dds_lightning.pipeline.record import recall
     from dds_lightning.pipeline.run import run_all
     from dds_lightning.pipeline.seeds import run_seeds
     from dds_lightning.pipeline.settings import RunSettings
 
+    folder = Path(out or f"runs/{get_task(task).file_name}")
+    typed = {
+        "data": data_spec(data) if data else None,
+        "seed": seed,
+        "preset": preset,
+        "data_steps": data_steps,
+        "clone_steps": clone_steps,
+        "evaluate_every": evaluate_every,
+        "episodes": episodes,
+        "episodes_per_skill": episodes_per_skill,
+        "selection": selection,
+        "temperature": temperature,
+        "noise_scale": noise_scale,
+        "seeds": seeds,
+    }
+    asked, words = recall(folder, task, typed, stages)
+    seeds, asked["seed"] = asked.pop("seeds"), asked["seed"] or 0
     settings = RunSettings.with_preset(
         task=task,
-        out=Path(out or f"runs/{get_task(task).file_name}"),
-        data=data_spec(data) if data else None,
-        seed=seed,
-        preset=preset,
-        data_steps=data_steps,
-        clone_steps=clone_steps,
-        evaluate_every=evaluate_every,
-        episodes=episodes,
-        episodes_per_skill=episodes_per_skill,
-        selection=selection,
-        temperature=temperature,
-        noise_scale=noise_scale,
+        out=folder,
         workers=workers,
         until=until,
         fresh=fresh,
         jobs=jobs,
-        stages={name: tuple(arguments) for name, arguments in stages.items()},
+        stages={name: tuple(arguments) for name, arguments in words.items()},
+        **asked,
     )
     return run_all(settings) if seeds is None else run_seeds(settings, seeds)
 

@@ -91,6 +91,8 @@ class _Remote:
         kind, payload = self._read()
         if kind == b"E":
             raise EnvPoolError(f"{self.name} failed:\n{payload.decode()}")
+        if kind == b"U":
+            raise UserError(payload.decode())
         return np.frombuffer(payload, self.dtype)
 
     def close(self) -> None:

@@ -17,6 +17,8 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dds_lightning.errors import UserError
+
 if TYPE_CHECKING:
     from dds_lightning.tasks import Task
 
@@ -173,6 +175,8 @@ def worker_main() -> None:
                 else:
                     answer = slots.step(*unpack_step(payload, task.action_dim)).tobytes()
             reply = b"O"
+        except UserError as error:
+            reply, answer = b"U", str(error).encode()
         except Exception:
             reply, answer = b"E", traceback.format_exc().encode()
         try:

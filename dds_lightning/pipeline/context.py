@@ -8,7 +8,7 @@ from dds_lightning.console.terminal import Terminal
 from dds_lightning.errors import UserError
 from dds_lightning.pipeline.settings import RunSettings, Trainings
 from dds_lightning.saving.run_directory import Done
-from dds_lightning.tasks import Task, get_task
+from dds_lightning.tasks import Task, get_task, is_own
 from dds_lightning.training.fit import quieten
 
 Settings = dict[str, Any]
@@ -46,6 +46,8 @@ class Run:
                 raise UserError(f"--{name} is {value}, expected at least 1")
         self.data_hash = self._look_at_data()
         self.trainings: Trainings = Trainings(settings, self.task)
+        if is_own(self.task):
+            _try_environment(self.task)
         self.console = Terminal(stderr=True)
         self.done: dict[str, Done] = {}
 
@@ -87,3 +89,13 @@ class Run:
     def say(self, text: str, style: str | None = None) -> None:
         """Tell the person at the terminal."""
         self.console.print(text, style=style, soft_wrap=True)
+
+
+def _try_environment(task: Task) -> None:
+    """Take one step: what an environment does wrong is told before anything is trained for it."""
+    env = task.make_env()
+    try:
+        env.reset(seed=0)
+        env.step(task.action_box()[0])
+    finally:
+        env.close()

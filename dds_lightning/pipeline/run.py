@@ -16,6 +16,7 @@ from dds_lightning.errors import UserError
 from dds_lightning.pipeline.beside import Beside, Work
 from dds_lightning.pipeline.child import Lines, await_turn
 from dds_lightning.pipeline.context import Run
+from dds_lightning.pipeline.record import keep
 from dds_lightning.pipeline.settings import RunSettings
 from dds_lightning.pipeline.steps import STEPS, Step, reading_starts
 from dds_lightning.saving.run_directory import MARKER, Done, RunDirectory, duration, locked, read_marker
@@ -36,6 +37,7 @@ def run_all(settings: RunSettings) -> Report:
             chosen = f"evaluating in {run.task.name} ({run.task.env_id})"
             run.say(f"the data were recorded in another physics than {run.asked.name}'s: {chosen}")
         keep_task(run.out, run.task)
+        keep(settings)
         _do_steps(run)
     return _report(run, time.monotonic() - started)
 

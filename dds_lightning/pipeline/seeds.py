@@ -27,6 +27,7 @@ from dds_lightning.interpret.draw.bars import plot_scores
 from dds_lightning.interpret.draw.png import png_bytes
 from dds_lightning.pipeline.child import Children, tell
 from dds_lightning.pipeline.context import Run
+from dds_lightning.pipeline.record import keep
 from dds_lightning.pipeline.run import run_all
 from dds_lightning.pipeline.settings import RunSettings
 from dds_lightning.saving.files import written_whole
@@ -59,6 +60,7 @@ def run_seeds(wanted: RunSettings, count: int) -> Report:
     }
     turns, started = Turns(wanted.jobs or available_cores()), time.monotonic()
     with locked(wanted.out):
+        keep(wanted, count)
         with Children(count) as children:
             working = {seed: children.submit(_run, children, turns, settings) for seed, settings in runs.items()}
             errors = [error for future in working.values() if (error := _error(future))]

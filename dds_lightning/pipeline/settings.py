@@ -69,14 +69,16 @@ class RunSettings:
         missing = {name: value for name, value in defaults.items() if asked.get(name) is None}
         return cls(task=task, out=out, preset=preset, **{**asked, **missing})
 
+    def asked(self) -> dict[str, Any]:
+        """The settings that differ from the preset's, by name; `seed` always, arguments of stages aside."""
+        usual = RunSettings.with_preset(self.task, self.out, self.preset)
+        names = ("data", *RUN_DEFAULTS, "evaluate_every", "episodes")
+        found = {name: getattr(self, name) for name in names if getattr(self, name) != getattr(usual, name)}
+        return {"seed": self.seed, **({"preset": self.preset} if self.preset else {}), **found}
+
     def command(self) -> str:
         """The command line that makes the same run again, `--out` aside."""
-        usual = RunSettings.with_preset(self.task, self.out, self.preset)
-        arguments = ["dds", "run", self.task, f"--seed={self.seed}"]
-        for name in ("data", "preset", *RUN_DEFAULTS, "evaluate_every", "episodes"):
-            value = getattr(self, name)
-            if value != getattr(usual, name) or (name == "preset" and value):
-                arguments.append(f"--{name}={value}")
+        arguments = ["dds", "run", self.task, *(f"--{name}={value}" for name, value in self.asked().items())]
         arguments += [f"--{stage}.{one.removeprefix('--')}" for stage in STAGES for one in self.stages.get(stage, ())]
         return shlex.join(arguments)
 

@@ -160,6 +160,31 @@ def publish(
     return Path(directory)
 
 
+def refuse_another(directory: str | os.PathLike[str], state: Mapping[str, Tensor]) -> None:
+    """Refuse a directory with other weights, so that a name typed once more costs nobody an agent.
+
+    Args:
+        directory: Where an agent is to be published.
+        state: Its weights, keys as in `Published.state`.
+
+    Raises:
+        UserError: Another agent was published there, or one that cannot be read.
+    """
+    target = expand(directory).resolve()
+    mend_folder(target)
+    if not os.path.lexists(target / SUMS):
+        return
+    try:
+        held = load_published(target)
+    except UserError as error:
+        raise UserError(f"{error}; --replace puts the new agent in its place") from None
+    if held.state.keys() != state.keys() or any(not held.state[key].equal(state[key].cpu()) for key in state):
+        raise UserError(
+            f"{directory} holds another published agent (task {held.config.get('task')}), which would be lost: choose "
+            "another directory, or give --replace"
+        )
+
+
 def load_published(directory: str | os.PathLike[str]) -> Published:
     """Read and verify a published directory.
 

@@ -30,6 +30,7 @@ _EVIDENCE = (
     ("way_share", "way from start to goal at the data's pace, % of an episode's steps", ".0f", 100.0),
     ("codes_used", "codes in use (training segments)", ".0f", 1.0),
     ("expected_fall", "fall of held-out loss with a quarter more skill steps, %", ".1f", 100.0),
+    ("overfit", "rise of held-out skill loss above its lowest level, %", ".0f", 100.0),
     ("fidelity", "error of replayed skills, in distances between two segments", ".3f", 1.0),
     ("fidelity_clone", "the same for behaviour cloning", ".3f", 1.0),
     ("beta_loss", "cross entropy of held-out skills by the data's policy, nats", ".2f", 1.0),

@@ -82,18 +82,26 @@ def skill_evidence(skill: SkillModule, checkpoint: Path) -> dict[str, Any]:
 
     Returns:
         `codes_used` (codes with at least a tenth of the share 1/K, by the running usage), `num_skills`, and, where its
-        validations allow it, `expected_fall`: by which share a quarter more steps would lower held-out loss.
+        validations allow it, `expected_fall`: by which share a quarter more steps would lower held-out loss; and where
+        it has risen while training loss fell, `overfit` (by which share) and `lowest_step` (since when).
     """
     from dds_lightning.callbacks.best import callback_state
-    from dds_lightning.callbacks.convergence import Convergence, expected_fall
+    from dds_lightning.callbacks.convergence import Convergence, expected_fall, overfit
     from dds_lightning.saving.checkpoint import load_ckpt
 
     found: dict[str, Any] = {"num_skills": skill.num_skills}
     if skill.discrete:
         found["codes_used"] = int(skill.bottleneck.health()["codes_used"])
     kept = callback_state(load_ckpt(checkpoint), Convergence) if checkpoint.suffix == ".ckpt" else None
-    fall = expected_fall([(int(step), float(loss)) for step, loss in kept["history"]]) if kept else float("nan")
-    return found if np.isnan(fall) else {**found, "expected_fall": fall}
+    if kept is None:
+        return found
+    history, trained = (
+        [(int(step), float(loss)) for step, loss in kept.get(name, [])] for name in ("history", "trained")
+    )
+    if history and not np.isnan(fall := expected_fall(history)):
+        found["expected_fall"] = fall
+    rise, lowest = overfit(history, trained)
+    return {**found, "overfit": rise, "lowest_step": lowest} if rise > 0 else found
 
 
 def fidelity_evidence(

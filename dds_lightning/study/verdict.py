@@ -6,6 +6,7 @@
    ├─ episodes end early, no termination says why ──► data
    ├─ a maze, and too slow to cross it in time ─────► data
    ├─ fewer than half of the codes in use ──────────► skills
+   ├─ held-out loss rose while training loss fell ──► skills
    ├─ beta is worse than the codes' plain shares ───► policy
    ├─ V does not rank held-out returns ─────────────► critic
    ├─ pi is beta, or always the best code ──────────► policy
@@ -21,6 +22,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from typing import NamedTuple
+
+from dds_lightning.callbacks.convergence import OVERFIT
 
 CRITIC_RANK = 0.3
 """Correlations of V with held-out returns were 0.5 to 0.74 in good runs, 0.03 to 0.15 with untrained critics."""
@@ -90,6 +93,13 @@ def verdict(scores: Mapping[str, float], evidence: Mapping[str, float]) -> Verdi
             f"Skills: only {evidence['codes_used']:.0f} of {evidence['num_skills']:.0f} codes are in use. "
             "Keep codebook_init=kmeans and restart_threshold above 0, lower --skill.model.lr, or ask for fewer codes "
             "with --skill.model.num_skills.",
+        )
+    if ask("overfit", 0.0) > OVERFIT:
+        return Verdict(
+            "skill",
+            f"Skills: overfit. Held-out loss rose by {100 * evidence['overfit']:.0f} % since step "
+            f"{evidence['lowest_step']:,.0f} while training loss fell. Collect more data, or lower "
+            "--skill.trainer.max_steps.",
         )
     if ask("beta_loss", 0.0) > ask("share_loss", math.inf):
         return Verdict(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,9 @@ from numpy.typing import NDArray
 
 from dds_lightning.envs.build import build_env
 from dds_lightning.envs.flatten import flatten
+from dds_lightning.envs.interface import answer_of
 from dds_lightning.envs.kitchen import goal_vector, kitchen_layout
+from dds_lightning.errors import UserError
 from dds_lightning.tasks.bodies import body_of
 
 if TYPE_CHECKING:
@@ -90,19 +93,45 @@ class TaskEnv(gym.Wrapper[Flat, Flat, Any, Any], gym.utils.RecordConstructorArgs
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Flat, dict[str, Any]]:
         """Start an episode."""
-        observation, info = self.env.reset(seed=seed, options=options)
+        observation, info = answer_of(self.env, "reset", seed=seed, options=options)
         return self._outside(observation, info)
 
     def step(self, action: Flat) -> tuple[Flat, float, bool, bool, dict[str, Any]]:
         """Take one step in the environment."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
+        observation, reward, terminated, truncated, info = answer_of(self.env, "step", action)
         flat, info = self._outside(observation, info)
-        return flat, float(reward), bool(terminated), bool(truncated), info
+        try:
+            paid = float(reward)
+        except (TypeError, ValueError):
+            paid = math.nan
+        if not math.isfinite(paid):
+            raise UserError(
+                f"{self._who()} pays a reward of {reward}, expected a finite number: no score has a meaning"
+            )
+        return flat, paid, bool(terminated), bool(truncated), info
+
+    def _who(self) -> str:
+        return f"the environment of {self.task.name} ({self.task.env_id})"
 
     def _outside(self, observation: Any, info: dict[str, Any]) -> tuple[Flat, dict[str, Any]]:
         """Return the observation for the agent and the `info` for the caller."""
         info["success"] = bool(info.get("success", info.get("is_success", False)))
-        return np.asarray(self.flatten(observation), dtype=np.float32), info
+        try:
+            flat = np.asarray(self.flatten(observation), dtype=np.float32)
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(f"{self._who()} gives an observation that is no array of numbers: {error}") from None
+        if flat.shape != (self.task.observation_dim,):
+            expected = f"expected {(self.task.observation_dim,)}, as its observation_space says"
+            raise UserError(
+                f"{self._who()} gives an observation of shape {flat.shape}, {expected}: mend step and reset"
+            )
+        if not np.isfinite(flat).all():
+            column = int(np.argmin(np.isfinite(flat)))
+            raise UserError(
+                f"{self._who()} gives an observation with {flat[column]} in column {column}, expected finite numbers: "
+                "end the episode before it gets there, or mend the simulation"
+            )
+        return flat, info
 
     def flatten(self, observation: Any) -> Any:
         """The task's flat observation, (O,)."""

@@ -1,6 +1,7 @@
 """A training ends when its curve says that more would hardly help, and not before."""
 
 import math
+import re
 from types import SimpleNamespace
 
 import lightning.pytorch as pl
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from dds_lightning.callbacks.convergence import Convergence, expected_fall
+from dds_lightning.callbacks.convergence import OVERFIT, Convergence, expected_fall, overfit
 from dds_lightning.callbacks.rolling import RollingCheckpoint
 from dds_lightning.errors import UserError
 from dds_lightning.training.trainer import trainer_settings
@@ -73,9 +74,11 @@ def test_with_steps_the_curve_is_noted_and_ends_nothing():
 
 def test_the_curve_survives_a_checkpoint_of_plain_values():
     first, second = Convergence(), Convergence()
-    first.history = curve(0.3)
+    first.history, first.trained = curve(0.3), curve(0.4)
     second.load_state_dict(first.state_dict())
-    assert second.history == first.history
+    assert (second.history, second.trained) == (first.history, first.trained)
+    second.load_state_dict({"history": first.history, "ends": None, "rates": None})  # as an earlier version wrote it
+    assert second.trained == []
 
 
 def test_a_training_that_ended_early_says_what_more_steps_would_bring():
@@ -88,6 +91,36 @@ def test_a_training_that_ended_early_says_what_more_steps_would_bring():
     )
     callback.history = curve(1.0, floor=1.0)
     assert callback.remark() is None  # it has levelled off
+
+
+def valley(depth, noise=0.0):
+    """Falls for a third of the training, then rises to `depth` times its lowest loss."""
+    third = len(STEPS) // 3
+    loss = np.concatenate([np.linspace(3.0, 1.0, third), np.linspace(1.0, depth, len(STEPS) - third)])
+    return list(zip(STEPS.tolist(), loss * (1 + noise * np.random.default_rng(0).normal(size=len(STEPS))), strict=True))
+
+
+def test_held_out_loss_that_rises_while_training_loss_falls_is_told():
+    rise, lowest = overfit(valley(1.6, noise=0.03), curve(0.5, noise=0.1))
+    assert rise == pytest.approx(0.6, abs=0.1)
+    assert lowest < STEPS[len(STEPS) // 2]
+    callback = Convergence(monitor="val/denoising")
+    callback.history, callback.trained = valley(1.6), curve(0.5)
+    assert re.match(r"val/denoising has risen by \d\d % since step [\d,]+ while training loss fell", callback.remark())
+
+
+@pytest.mark.parametrize(
+    ("held_out", "trained"),
+    [
+        (curve(0.3, noise=0.05), curve(0.5, noise=0.2)),  # both fall
+        (curve(1.0, floor=1.0, noise=0.05), curve(0.5)),  # levelled off
+        (valley(1.6), curve(-0.5)),  # training has diverged: both rise
+        (valley(1.6), []),  # a checkpoint of an earlier version
+        (valley(1.6)[:5], curve(0.5)[:5]),  # too few validations
+    ],
+)
+def test_no_other_curve_counts_as_overfit(held_out, trained):
+    assert overfit(held_out, trained)[0] < OVERFIT
 
 
 def test_a_metric_that_nobody_logs_is_named_beside_those_that_are():

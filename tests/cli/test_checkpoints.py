@@ -54,6 +54,21 @@ def test_checkpoints_of_separate_stages_can_be_published(dds):
     assert agent.policy is None
 
 
+def test_another_agent_is_replaced_only_where_that_is_asked_for(dds):
+    """The same agent may be published once more, for example with another card."""
+    torch.manual_seed(0)
+    for name in ("mine", "other"):
+        skill = SkillModule(4, 2, num_skills=4, skill_dim=8, hidden_dim=16, encoder_layers=1, encoder_heads=2)
+        DDSAgent(skill, selection="random").save(name)
+    Path("card.md").write_text("# Mine\n")
+    assert dds("publish", "mine", "shared")[0] == 0
+    assert dds("publish", "mine", "shared", "--card", "card.md")[0] == 0
+    refused(dds("publish", "other", "shared"), "shared holds another published agent", "or give --replace")
+    assert Path("shared/README.md").read_text() == "# Mine\n"
+    assert dds("publish", "other", "shared", "--replace")[0] == 0
+    assert DDSAgent.load("shared").golden() == DDSAgent.load("other").golden()
+
+
 @pytest.mark.parametrize(
     ("words", "parts"),
     [

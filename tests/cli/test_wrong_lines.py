@@ -172,6 +172,13 @@ def test_what_shows_only_in_training_is_one_sentence_too(dds, data, words, part)
     assert part in told(answer.err)
 
 
+def test_a_file_where_checkpoints_should_go_is_one_sentence(dds, data):
+    Path("taken").touch()
+    answer = dds(*words_of("S --checkpoint.dirpath=taken", data))
+    assert answer.status == 2
+    assert "checkpoint.dirpath is taken, but there is a file: give a folder" in told(answer.err)
+
+
 def test_slurm_variables_that_do_not_fit_are_one_sentence(dds, data, monkeypatch):
     monkeypatch.setenv("SLURM_NTASKS", "4")
     answer = dds(*words_of("S", data))

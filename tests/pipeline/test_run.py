@@ -83,6 +83,12 @@ def test_a_second_call_does_nothing(finished, capsys):
     assert {row["contestant"] for row in said["table"]} >= {"AWR policy, sampled", "random skills"}
 
 
+def test_a_second_call_with_nothing_but_the_folder_goes_on_with_the_same_settings(finished, capsys):
+    status, said, err = call(capsys, "--out", finished)
+    assert (status, said["done_before"]) == (0, STAGES)
+    assert "as in the earlier call: --data_steps=2000 " in err
+
+
 def test_the_agent_of_the_run_acts_without_data_or_run(finished, tmp_path):
     (tmp_path / "agent").symlink_to(finished / "agent")
     agent = DDSAgent.load(tmp_path / "agent", seed=3)
@@ -212,7 +218,7 @@ def test_the_best_policy_is_told_beside_the_last_and_leaves_when_it_is_not_wante
 
     _, said, err = call(capsys, *given, "--evaluate_every=10", "--workers=0")
     assert said["done_before"] == STAGES  # how many processes play changes nothing
-    _, said, _ = call(capsys, *given)
+    _, said, _ = call(capsys, *given, "--evaluate_every=0")
     assert said["done_before"] == ["data", "skill", "relabel", "clone"]
     assert said["protocol"]["best"] is None
     assert not (out / "evaluate" / "best").exists()

@@ -29,6 +29,11 @@ EVIDENCE = {
         ({"way_share": 1.02}, "data", "Data: too slow to arrive. .* takes 102 % of the steps"),
         ({"codes_used": 4}, "skill", "Skills: only 4 of 16 codes are in use"),
         (
+            {"overfit": 0.6, "lowest_step": 4000},
+            "skill",
+            "Skills: overfit. Held-out loss rose by 60 % since step 4,000 while .* Collect more data, or lower --skill",
+        ),
+        (
             {"beta_loss": 8.8, "critic_rank": 0.05},
             "policy",
             r"heart\. .* likely by it \(8.8 nats\) than by their plain shares \(2.7\)\. Raise --policy.model.dropout",
