@@ -18,18 +18,8 @@ from dds_lightning.grid.results import PULLS, Results, remember
 from dds_lightning.saving.files import written_whole
 from dds_lightning.saving.run_directory import duration
 from dds_lightning.saving.templates import render
-from dds_lightning.study.paper import DATA_DIFFER
+from dds_lightning.study.paper import DATA_DIFFER, LAYOUTS
 from dds_lightning.study.tables import markdown
-
-PAPERS = {
-    "table1": "Laid out as the paper's table 1.",
-    "table2": "Laid out as the paper's table 2, which is for AntMaze-Large-Diverse. It finds that K matters where D is "
-    "small (no success with K 32 and D 32 or 64) and hardly where D is 128 or more.",
-    "table3": "Laid out as the paper's table 3; its numbers beside a maze are for AntMaze-Large-Diverse. It finds the "
-    "transformer with the diffusion decoder ahead of all other pairs by a wide margin.",
-    "figure5": "Laid out as the paper's figure 5, which has curves and no numbers.",
-    "figure6": "Laid out as the paper's figure 6, which has curves and no numbers; it finds that H hardly matters.",
-}
 
 
 @dataclass
@@ -98,8 +88,8 @@ def _sections(results: Results) -> list[Section]:
     if study["budget"]:
         stated = duration(60 * study["budget"] * study["scale"])
         opening.append(f"Stated budget: {stated} of one core; spent: {duration(results.seconds)}.")
-    if study["paper"] in PAPERS:
-        opening.append(f"{PAPERS[study['paper']]} {DATA_DIFFER}")
+    if study["paper"] in LAYOUTS:
+        opening.append(f"{LAYOUTS[study['paper']]} {DATA_DIFFER}")
     if cells.empty:
         return [Section("", [*opening, "No cell is done yet."]), *_making(results)]
     sections = [Section("", opening), Section("Scores", [], results.table())]

@@ -12,7 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from dds_lightning.errors import UserError
-from dds_lightning.grid.file import BASE, PLAYERS
+from dds_lightning.grid.cells import BASE, PLAYERS, label, shown
 from dds_lightning.grid.found import Found, check_key, found_elsewhere
 from dds_lightning.grid.job import NODES
 from dds_lightning.saving.untrusted import TEXT, conform, mapping, parsing, read_json
@@ -98,7 +98,7 @@ class Results:
 
     def label(self, name: Any) -> str:
         """What the report calls an axis or a value."""
-        return str(self.study["labels"].get(str(name), PLAYERS[name].title if name in PLAYERS else name))
+        return label(self.study["labels"], name)
 
     def name(self, where: Mapping[str, Any]) -> str:
         """A place in the grid, in words: values that speak for themselves without their axis."""
@@ -215,7 +215,9 @@ class Results:
 
 def _row(cell: Mapping[str, Any], found: Found) -> dict[str, Any]:
     """One row of `Results.cells`."""
-    row = {"task": cell["task"], "method": cell["method"], **cell["place"], "seed": cell["seed"], "key": cell["key"]}
+    # What pandas cannot group by (lists), or reads as missing (null), stands as text.
+    place = {axis: one if type(one) in (str, int, float) else shown(one) for axis, one in cell["place"].items()}
+    row = {"task": cell["task"], "method": cell["method"], **place, "seed": cell["seed"], "key": cell["key"]}
     row |= {"title": cell["title"], "state": "open", "score": np.nan, "best": np.nan, "chosen": ""}
     row |= {"horizon": np.nan, "hold": np.nan}
     if (outcome := found.outcomes.get(cell["key"])) is not None:

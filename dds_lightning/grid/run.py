@@ -21,8 +21,9 @@ from dds_lightning.console.reports import Report
 from dds_lightning.console.terminal import Terminal
 from dds_lightning.envs.pool import available_cores
 from dds_lightning.errors import UserError
+from dds_lightning.grid.cells import Cell, Study
 from dds_lightning.grid.engines import ENGINES, Engine, Local, RayTasks, Slurm
-from dds_lightning.grid.file import Cell, Study, find_study, read_study
+from dds_lightning.grid.file import find_study, read_study
 from dds_lightning.grid.found import Found, found_elsewhere
 from dds_lightning.grid.job import NODES
 from dds_lightning.grid.loop import Progress, run_nodes

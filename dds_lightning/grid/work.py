@@ -11,8 +11,7 @@ from typing import Any
 
 from dds_lightning.agent import DDSAgent
 from dds_lightning.configs import known_as
-from dds_lightning.errors import UserError
-from dds_lightning.grid.file import PLAYERS
+from dds_lightning.grid.cells import PLAYERS
 from dds_lightning.grid.nodes import arguments
 from dds_lightning.rollout.actors import Contestant
 from dds_lightning.rollout.play import rollout
@@ -89,10 +88,6 @@ def evaluate(settings: Facts, how: Facts, reads: Reads, folder: Path, resuming: 
         actor = method.play(checkpoints)
         if isinstance(actor, DDSAgent):
             actor = actor.variant(**acting, seed=settings["seed"])
-        elif how["asked"]:
-            raise UserError(
-                f"evaluate.{how['asked'][0]} is for agents over skills, which {method.title} has not: leave it out"
-            )
         players.append(Contestant(name, actor, settings["episodes"]))
     result = rollout(task, players, seed=settings["seed"], workers=0)
     result.save(folder)

@@ -69,7 +69,8 @@ def made(tmp_path, best=False, left_out=(), **keys):
     root = tmp_path / NODES
     directory = RunDirectory(root, Console(quiet=True))
     for index, (cell, node) in enumerate(cells.values()):
-        score = SCORES.get(tuple(cell.place.values()), (1, 2, 3))[cell.seed]
+        score = {str(place): scores for place, scores in SCORES.items()}.get(str(tuple(cell.place.values())), (1, 2, 3))
+        score = score[cell.seed]
         work = evaluation({"last": score, **({"best": score + 1} if best else {})})
         for one in in_order([node]).values():
             if one.kind == "evaluate" and index in left_out:
@@ -175,6 +176,17 @@ def test_a_study_that_is_not_finished_has_a_report_of_what_there_is(tmp_path):
     empty = made(tmp_path / "empty", left_out=range(12))
     report_study(empty)
     assert "No cell is done yet." in (empty / "report" / "report.md").read_text()
+
+
+def test_values_that_are_lists_or_null_have_rows_of_their_own(tmp_path):
+    grid = {"policy.model.hidden_dims": [[64], [64, 64]], "skill.model.codebook_ema": [None, 0.5]}
+    place = made(tmp_path, grid=grid, rows=[], columns=[], labels={"skill.model.codebook_ema": "EMA", "[64]": "narrow"})
+    results = Results.read(place)
+    assert results.cells["skill.model.codebook_ema"].unique().tolist() == ["null", 0.5]
+    assert list(results.groups())[:2] == [f"policy.model.hidden_dims narrow, EMA {value}" for value in ("null", 0.5)]
+    assert len(results.groups()) == 4
+    report_study(place)
+    assert "| narrow | 2.0 ± 1.0 | 2.0 ± 1.0 |" in (place / "report" / "report.md").read_text()
 
 
 @pytest.mark.parametrize(("horizon", "hold"), [(10, None), (20, 5)])
