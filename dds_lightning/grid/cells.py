@@ -118,6 +118,11 @@ class Study:
         ]
 
 
+def counted(count: int, noun: str) -> str:
+    """`1 cell`, `2 cells`."""
+    return f"{count} {noun}" + "s" * (count != 1)
+
+
 def shown(value: Any) -> str:
     """A value of a setting, as a study file may say it: `5`, `0.5`, `gru`, `[64, 64]`, `null`."""
     if isinstance(value, float):
