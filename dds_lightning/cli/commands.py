@@ -205,8 +205,9 @@ def evaluate(
     from dds_lightning.study.evaluate import evaluate as play
 
     if directory in (None, "-") and policy is not None and (method := baseline_at(policy)):
-        of_codes = {"noise_scale": noise_scale, "temperature": None if temperature == 1.0 else temperature}
-        return evaluate_baseline(method, policy, skill, task, episodes, seed, workers, out, **of_codes)
+        acting = {"noise_scale": noise_scale, "temperature": None if temperature == 1.0 else temperature, "hold": hold}
+        chosen = {**acting, "selection": selection[0] if len(selection) == 1 else None}
+        return evaluate_baseline(method, policy, skill, task, episodes, seed, workers, out, **chosen)
     return play(
         None if directory in (None, "-") else Path(str(directory)),
         skill=skill,

@@ -39,7 +39,7 @@ def evaluate_baseline(
     seed: int,
     workers: int | None,
     out: str | None,
-    **unused: Any,
+    **acting: Any,
 ) -> Report:
     """Play a baseline; arguments and JSON keys are those of `dds evaluate`.
 
@@ -52,13 +52,14 @@ def evaluate_baseline(
         seed: Of environments and actor.
         workers: Processes for the environments.
         out: Parquet file for the episodes.
-        **unused: Settings of agents over codes that were given all the same.
+        **acting: Settings of agents over skills; None takes the agent's.
 
     Raises:
         UserError: A checkpoint is missing or does not fit, or a setting does not apply.
     """
-    for name, value in unused.items():
-        if value is not None:
+    chosen = {name: value for name, value in acting.items() if value is not None}
+    if "skill" not in method.stages:
+        for name, value in chosen.items():
             raise UserError(f"--{name} is {value}, which {method.title} has no use for: leave it out")
     given = {"skill": skill, method.stages[-1]: policy}
     if skill is not None and "skill" not in method.stages:
@@ -69,6 +70,7 @@ def evaluate_baseline(
     count = episodes_to_play(wanted, episodes)
     actor = method.play({name: path for name, path in given.items() if path is not None})
     _refuse_other_task(actor, policy, wanted)
+    actor = actor.variant(**chosen, seed=seed) if chosen else actor
     result = rollout(wanted, [Contestant(method.title, actor, count)], seed=seed, workers=workers)
     summary = result.summary()
     summary.insert(1, "checkpoint", LAST)

@@ -12,7 +12,7 @@ def run(
     engine: Literal["local", "ray", "slurm"] = "local",
     workers: int | None = None,
     scale: float = 1.0,
-    cpus: float = 1,
+    cpus: int = 1,
     gpus: float = 0,
     minutes: int = 240,
     plan: bool = False,

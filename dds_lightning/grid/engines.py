@@ -11,13 +11,14 @@ import queue
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Protocol
 
 from dds_lightning.errors import UserError, lacks_extra
-from dds_lightning.grid.job import Job, do
+from dds_lightning.grid.job import Job, do_logged
 
 Answer = dict[str, Any]
 TRIES = 3
@@ -131,19 +132,34 @@ class RayTasks:
         workers: Tasks at once; None submits all that are ready.
         cpus: Of each task.
         gpus: Of each task; may be a fraction.
+
+    Raises:
+        UserError: Ray is not installed, or no task could ever begin on this machine.
     """
 
-    def __init__(self, workers: int | None, cpus: float = 1, gpus: float = 0) -> None:
+    def __init__(self, workers: int | None, cpus: int = 1, gpus: float = 0) -> None:
         ray = _package("ray", "--engine=ray needs Ray", "ray")
         self.ray, self.slots = ray, workers or 1000
+        here = "RAY_ADDRESS" not in os.environ
         if not ray.is_initialized():
-            ray.init(
-                log_to_driver=False,
-                configure_logging=False,
-                **({} if "RAY_ADDRESS" in os.environ else {"num_cpus": workers, "include_dashboard": False}),
-            )
+            count = None if workers is None else workers * cpus
+            alone = {"num_cpus": count, "include_dashboard": False} if here else {}
+            ray.init(log_to_driver=False, configure_logging=False, **alone)
+        self._refuse_too_much(cpus, gpus, here)
         # A worker that is lost is Ray's to replace; an error of ours is an answer, and not tried again.
-        self._do = ray.remote(max_retries=TRIES - 1, num_cpus=cpus, num_gpus=gpus)(do)
+        self._do = ray.remote(max_retries=TRIES - 1, num_cpus=cpus, num_gpus=gpus)(do_logged)
+
+    def _refuse_too_much(self, cpus: int, gpus: float, here: bool) -> None:
+        """Refuse tasks that would wait for ever on this machine; say so of a cluster, which may grow."""
+        nodes = [node["Resources"] for node in self.ray.nodes() if node["Alive"]]
+        if any(node.get("CPU", 0) >= cpus and node.get("GPU", 0) >= gpus for node in nodes):
+            return
+        most = ", ".join(f"{node.get('CPU', 0):g} and {node.get('GPU', 0):g}" for node in nodes) or "none"
+        asked = f"--cpus is {cpus} and --gpus is {gpus:g}, which no node of Ray has (CPUs and GPUs of each: {most})"
+        if here:
+            self.close()
+            raise UserError(f"{asked}: ask for less")
+        warnings.warn(f"{asked}: jobs wait until such a node joins the cluster", stacklevel=3)
 
     def submit(self, job: Job) -> Future[Answer]:
         """As `Engine.submit`."""
@@ -160,7 +176,7 @@ class Requeued:
 
     def __call__(self, job: Job) -> Answer:
         """Do it."""
-        return do(job)
+        return do_logged(job)
 
     def checkpoint(self, job: Job) -> Any:
         """What submitit submits again after a preemption or a timeout."""
@@ -186,7 +202,7 @@ class Slurm:
         folder: Path,
         workers: int | None,
         cpus: int = 1,
-        gpus: int = 0,
+        gpus: float = 0,
         minutes: int = 240,
         cluster: str = "slurm",
     ) -> None:
@@ -198,13 +214,19 @@ class Slurm:
             raise UserError(
                 f"--engine is slurm, and submitit finds no Slurm here ({error}): run it on a login node"
             ) from None
-        self._executor.update_parameters(timeout_min=minutes, cpus_per_task=cpus, gpus_per_node=gpus, name="dds-study")
+        self._executor.update_parameters(
+            timeout_min=minutes, cpus_per_task=cpus, gpus_per_node=int(gpus), name="dds-study"
+        )
+        self._refusal: type[Exception] = submitit.core.utils.FailedJobError
         self._threads, self.closed = ThreadPoolExecutor(self.slots), False
         self._jobs: list[Any] = []
 
     def submit(self, job: Job) -> Future[Answer]:
         """As `Engine.submit`."""
-        submitted = self._executor.submit(Requeued(), dict(job))
+        try:
+            submitted = self._executor.submit(Requeued(), dict(job))
+        except self._refusal as error:
+            raise UserError(f"--engine is slurm, and it refuses the job ({' '.join(str(error).split())})") from None
         self._jobs.append(submitted)
         return self._threads.submit(self._wait, submitted)
 
@@ -227,6 +249,26 @@ class Slurm:
 
 ENGINES: dict[str, Callable[..., Engine]] = {"local": Local, "ray": RayTasks, "slurm": Slurm}
 """Name -> engine; `run` gives each its arguments."""
+
+
+def refuse_request(engine: str, workers: int | None, cpus: int, gpus: float, minutes: int) -> None:
+    """Refuse what cannot be asked of an engine.
+
+    Raises:
+        UserError: Names the first.
+    """
+    whole = float(gpus).is_integer()
+    rules = (
+        ("engine", engine, engine in ENGINES, f"one of {', '.join(ENGINES)}"),
+        ("workers", workers, workers is None or workers >= 1, "at least 1"),
+        ("cpus", cpus, isinstance(cpus, int) and cpus >= 1, "a whole number of at least 1"),
+        ("gpus", gpus, 0 <= gpus < float("inf"), "0 or more"),
+        ("gpus", gpus, whole or (engine != "slurm" and gpus < 1), "a whole number, or with --engine ray less than 1"),
+        ("minutes", minutes, minutes >= 1, "at least 1"),
+    )
+    for name, value, fine, expected in rules:
+        if not fine:
+            raise UserError(f"--{name} is {value}, expected {expected}")
 
 
 def _package(name: str, what: str, extra: str) -> Any:

@@ -60,14 +60,17 @@ def plot_online(curves: Mapping[str, list[pd.DataFrame]]) -> Figure:
     Args:
         curves: Setting -> a table for each seed, with `env_steps` and `value`.
     """
-    figure, axes = _axes("environment steps", "success or return of the latest episodes")
+    figure, axes = _axes("environment steps", "success (%) or return of the latest episodes")
     for name, tables in curves.items():
         end = min(table["env_steps"].max() for table in tables)
         grid = np.linspace(0.0, end, 100)
         values = np.stack([np.interp(grid, table["env_steps"], table["value"]) for table in tables])
-        (line,) = axes.plot(grid, values.mean(axis=0), label=name)
-        low, high = values.mean(axis=0) - values.std(axis=0), values.mean(axis=0) + values.std(axis=0)
-        axes.fill_between(grid, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
+        mean, spread = values.mean(axis=0), values.std(axis=0, ddof=1) if len(values) > 1 else 0.0
+        (line,) = axes.plot(grid, mean, label=name)
+        # Success is in per cent: a band beyond 0 and 100 would promise what cannot be.
+        limits = (0.0, 100.0) if values.min() >= 0 and values.max() <= 100 else (-np.inf, np.inf)
+        band = np.clip([mean - spread, mean + spread], *limits)
+        axes.fill_between(grid, *band, color=line.get_color(), alpha=0.2, linewidth=0)
     axes.legend(frameon=False, fontsize=8)
     return figure
 
@@ -85,7 +88,7 @@ def plot_intervals(comparison: pd.DataFrame) -> Figure:
 
 
 def plot_profiles(groups: Mapping[str, pd.DataFrame]) -> Figure:
-    """Performance profiles: the share of runs that score more than each threshold."""
+    """Performance profiles, of the first `MOST` settings: the share of runs that score more than each threshold."""
     figure, axes = _axes("normalised score", "share of runs above", (8.0, 3.6))
     top = max(100.0, *(float(scores.to_numpy().max()) for scores in groups.values()))
     thresholds = np.linspace(0.0, top, 201)

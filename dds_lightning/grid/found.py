@@ -25,6 +25,8 @@ FORMAT = 1
 FILE = "results.json"
 KEY = re.compile(r"[a-z0-9_]+-[0-9a-f]{16}")
 """The name of a job and of its folder."""
+CELL = re.compile(r"evaluate-[0-9a-f]{16}")
+"""The same of an evaluation, which alone may be a cell."""
 REMEDY = "give the `results.json` that `dds study run` wrote into a report"
 WORK: Mapping[str, Any] = {
     "seconds": (int, float),
@@ -34,8 +36,10 @@ WORK: Mapping[str, Any] = {
     "made": (int, type(None)),
 }
 """The form of a finished job in the file; `made` is a place in the file's list of what results were made by."""
+MADE_BY: Mapping[str, Any] = {"versions": (dict,), "commit": (str, type(None)), "machine": (str,)}
+"""The form of what results were made by."""
 LONGEST = 10_000
-"""Characters of a command."""
+"""Characters of a command or of a reason."""
 
 
 @dataclass(frozen=True)
@@ -132,32 +136,42 @@ class Found:
         return cls(works, outcomes, curves)
 
     @classmethod
-    def load(cls, path: Path) -> Found:
+    def load(cls, path: Path, remedy: str = REMEDY) -> Found:
         """Read a `results.json`.
+
+        Args:
+            path: The file.
+            remedy: What to do where it is missing or damaged.
 
         Raises:
             UserError: It is missing, damaged, of a newer version, or another file.
         """
         if not path.is_file():
-            raise UserError(f"{path} is not there: {REMEDY}")
-        with parsing(path, REMEDY):
+            raise UserError(f"{path} is not there: {remedy}")
+        with parsing(path, remedy):
             value = mapping(read_json(path, 64 * TEXT), path)
             refuse_newer(path, value.get("format"), FORMAT)
             conform(value, {"made": (list,), "nodes": (dict,), "cells": (dict,), "curves": (dict,)}, str(path))
-            made = [mapping(one, f"{path}, made") for one in value["made"]]
+            made = [_made_by(one, f"{path}, made") for one in value["made"]]
             works, outcomes = dict[str, Work](), dict[str, Outcome]()
             for key, entry in value["nodes"].items():
                 one = conform(entry, WORK, f"{path}, nodes, {check_key(key, path)}")
                 by = made[one["made"]] if one["made"] is not None else None
-                works[key] = Work(one["seconds"], _command(entry.get("command")), one["chosen"], one["horizon"], by)
+                works[key] = Work(one["seconds"], one_line(entry.get("command")), one["chosen"], one["horizon"], by)
             for key, entry in value["cells"].items():
-                what = f"{path}, cells, {check_key(key, path)}"
-                one = conform(entry, {"scores": {LAST: (int, float)}, "episodes": (list,)}, what)
-                scores = {name: float(score) for name, score in one["scores"].items()}
-                outcomes[key] = Outcome(scores, np.asarray(one["episodes"], np.float64))
-            curves = {check_key(key, path): pd.DataFrame(entry, dtype=float) for key, entry in value["curves"].items()}
-            if any(set(curve) != {"env_steps", "value"} for curve in curves.values()):
-                raise UserError(f"{path}: a curve has other columns than env_steps and value: {REMEDY}")
+                what = f"{path}, cells, {check_key(key, path, CELL)}"
+                one = conform(entry, {"scores": (dict,), "episodes": (list,)}, what)
+                number = (int, float)
+                scores = conform(one["scores"], {LAST: number, **dict.fromkeys(one["scores"], number)}, what)
+                outcomes[key] = Outcome(
+                    {name: float(score) for name, score in scores.items()}, _series(one["episodes"], what)
+                )
+            curves = dict[str, pd.DataFrame]()
+            for key, entry in value["curves"].items():
+                what = f"{path}, curves, {check_key(key, path, CELL)}"
+                if set(curve := mapping(entry, what)) != {"env_steps", "value"}:
+                    raise UserError(f"{what}: a curve has other columns than env_steps and value: {remedy}")
+                curves[key] = pd.DataFrame({name: _series(column, what) for name, column in curve.items()})
             return cls(works, outcomes, curves)
 
     def save(self, path: Path) -> None:
@@ -188,20 +202,38 @@ class Found:
         return [dict(one) for one in found.values() if one is not None]
 
 
-def check_key(key: str, file: Path) -> str:
-    """The name of a job, if it is one: it may become a path.
+def check_key(key: str, file: Path, form: re.Pattern[str] = KEY) -> str:
+    """The name of a job, if it is one, of a `form`: it may become a path.
 
     Raises:
         UserError: It is something else.
     """
-    if not KEY.fullmatch(str(key)):
+    if not form.fullmatch(str(key)):
         raise UserError(f"{file}: {str(key)[:80]!r} is no name of a job: run the study again")
     return key
 
 
+def _made_by(value: Any, what: str) -> dict[str, Any]:
+    """What results were made by, out of a file, if it has the right form."""
+    found = conform(value, MADE_BY, what)
+    return {**found, "versions": conform(found["versions"], dict.fromkeys(found["versions"], (str,)), what)}
+
+
+def _series(values: Any, what: str) -> NDArray[np.float64]:
+    """A list of one or more finite numbers.
+
+    Raises:
+        UserError: It is something else.
+    """
+    found = np.asarray(values, np.float64)
+    if found.ndim != 1 or not len(found) or not np.isfinite(found).all():
+        raise UserError(f"{what} has {str(values)[:80]}, expected a list of finite numbers: {REMEDY}")
+    return found
+
+
 def _made(folder: Path) -> dict[str, Any] | None:
     path = folder / MADE
-    return mapping(read_json(path, root=folder), path) if path.is_file() else None
+    return _made_by(read_json(path, root=folder), str(path)) if path.is_file() else None
 
 
 def _curve(root: Path, keys: Iterable[str]) -> pd.DataFrame | None:
@@ -218,8 +250,8 @@ def _curve(root: Path, keys: Iterable[str]) -> pd.DataFrame | None:
     return table[["env_steps", "value"]].dropna().sort_values("env_steps")
 
 
-def _command(given: str | None) -> str | None:
-    """A command out of a file that anybody may have written: one line to show, whole, with its quotes and braces."""
+def one_line(given: str | None) -> str | None:
+    """A command or a reason out of a file that anybody may have written: one line, whole, with quotes and braces."""
     if given is None:
         return None
     return "".join(letter for letter in given[:LONGEST] if letter.isprintable() and letter != "`")
@@ -236,13 +268,12 @@ def found_elsewhere(remembered: Path, given: Iterable[Path], jobs: Collection[st
     Raises:
         UserError: A file is missing or damaged, or a report has no cell of this study.
     """
-    found = Found.load(remembered).only(jobs) if remembered.is_file() else Found()
+    found = Found.load(remembered, "delete it, and give --known again").only(jobs) if remembered.is_file() else Found()
     for file in given:
         there = Found.load(file / FILE if file.is_dir() else file).only(jobs)
         if not there.outcomes:
             raise UserError(
-                f"--known: {file} has no cell of this study: its task, settings, seeds or preset are other ones; leave "
-                "it out"
+                f"--known: {file} has no cell of this study: its tasks, settings, seeds or preset differ; leave it out"
             )
         found |= there
     return found

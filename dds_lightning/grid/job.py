@@ -1,4 +1,4 @@
-"""One job of a study, wherever it runs: `do` is what every engine calls."""
+"""One job of a study, wherever it runs: `do_logged` is what every engine calls."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import subprocess
 import time
 import traceback
 from collections.abc import Mapping
+from contextlib import redirect_stderr, redirect_stdout
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -61,6 +62,22 @@ def do(job: Job) -> dict[str, Any]:
         traceback.print_exc()
         return {"seconds": time.monotonic() - started, "error": " ".join(told.split())[:500] or type(error).__name__}
     return {"seconds": time.monotonic() - started, "error": None}
+
+
+def do_logged(job: Job) -> dict[str, Any]:
+    """`do`, with all that it and its child processes print in the job's log, on whatever engine."""
+    path = Path(job["root"]) / LOGS / f"{job['key']}.txt"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    kept = {stream: os.dup(stream) for stream in (1, 2)}
+    with path.open("a", buffering=1, encoding="utf-8") as file, redirect_stdout(file), redirect_stderr(file):
+        try:
+            for stream in kept:  # of child processes, and of libraries that do not ask Python
+                os.dup2(file.fileno(), stream)
+            return do(job)
+        finally:
+            for stream, copy in kept.items():
+                os.dup2(copy, stream)
+                os.close(copy)
 
 
 @cache

@@ -12,14 +12,15 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
 from datamodules.relabelling import Relabelling
 from dds_lightning.configs import run_defaults
 from dds_lightning.errors import UserError
-from dds_lightning.grid.file import BUDGETS, OURS, PLAYERS, Cell, Study, argument
+from dds_lightning.grid.cells import BUDGETS, OURS, PLAYERS, Cell, Study, argument
+from dds_lightning.grid.checks import check_stage
 from dds_lightning.saving.untrusted import read_yaml
 from dds_lightning.tasks import facts_to_keep, get_task, is_own
 from dds_lightning.training.options import GENERAL, options
@@ -118,6 +119,7 @@ class _Planner:
         made: dict[str, Node] = {"data": self._data(cell)}
         for stage in stages:
             made[stage] = self._train(cell, stage, made)
+        self._check_acting(cell, made, asked)
         episodes = self._scaled(asked.get("episodes") or get_task(cell.task).evaluation_episodes)
         settings = {**self._task(cell), "method": cell.method, "seed": cell.seed, **self._acting(cell)}
         settings["episodes"] = episodes
@@ -127,8 +129,21 @@ class _Planner:
             settings,
             {stage: made[stage] for stage in stages},
             f"evaluate {cell.name()}",
-            {"asked": sorted(asked.keys() - {"episodes"})},
         )
+
+    def _check_acting(self, cell: Cell, made: Mapping[str, Node], asked: Mapping[str, Any]) -> None:
+        """Refuse settings of acting with which the evaluation would fail.
+
+        Raises:
+            UserError: The agent has no skills, or they do not last so long.
+        """
+        of_skills = sorted(asked.keys() - {"episodes"})
+        if of_skills and "skill" not in made:
+            title = PLAYERS[cell.method].title
+            raise UserError(f"evaluate.{of_skills[0]} is for agents over skills, and {title} has none: leave it out")
+        horizon = made["skill"].settings["data.horizon"] if "skill" in made else 0
+        if asked.get("hold", 0) > horizon:
+            raise UserError(f"evaluate.hold is {asked['hold']}, expected at most {horizon}, the steps that skills last")
 
     def _stages(self, cell: Cell) -> tuple[str, ...]:
         """What the cell trains; learning online over raw actions takes no skills."""
@@ -174,6 +189,9 @@ class _Planner:
         for name in BUDGETS:
             if isinstance(settings.get(name), int | float) and settings[name] > 0 and study.scale != 1:
                 settings[name] = given[name] = self._scaled(settings[name])
+        if any(key.startswith((f"{stage}.model.", f"{stage}.data.")) for key in cell.settings):
+            skill = made["skill"].settings if "skill" in made else {}
+            check_stage(stage, settings, cell.task, skill)
         reads = {"data": made["data"], **{name: made[name] for name in row.reads if name in made}}
         how: dict[str, Any] = {"config": config, "given": {k: v for k, v in given.items() if preset.get(k) != v}}
         if study.watch and stage == PLAYERS[cell.method].stages[-1] and stage in WATCHED:
@@ -184,11 +202,24 @@ class _Planner:
             own = {one.name: settings[f"data.{one.name}"] for one in fields(Relabelling)}
             own |= self._task(cell)
             reads["relabel"] = Node(
-                "relabel", "dds_lightning.grid.work:relabel", own, dict(reads), f"relabel {cell.name()}"
+                "relabel", "dds_lightning.grid.work:relabel", own, dict(reads), self._title(cell, "relabel")
             )
         settings = {key: value for key, value in settings.items() if key not in row.added or value != row.added[key]}
         settings |= {**self._task(cell), "seed": cell.seed, "stage": stage}
-        return Node(stage, "dds_lightning.grid.work:train", settings, reads, f"{stage} {cell.name()}", how)
+        return Node(stage, "dds_lightning.grid.work:train", settings, reads, self._title(cell, stage), how)
+
+    def _title(self, cell: Cell, kind: str) -> str:
+        """What a person reads while a training or its relabelling runs: what it depends on, for cells may share it."""
+        method = PLAYERS[cell.method]
+        last = kind == method.stages[-1]
+        stages = ("skill", "policy.data") if kind == "relabel" else method.stages[: method.stages.index(kind) + 1]
+        begin = tuple(f"{room}." for room in ("data", *stages))
+        place: dict[str, Any] = {} if last else dict(method.settings.get(kind, {}))
+        for axis, value in cell.place.items():
+            keys = self.study.variants.get(value, {}) if axis == "variant" else (axis,)
+            if any(key.startswith(begin) for key in keys):
+                place[axis] = value
+        return f"{kind} {replace(cell, place=place).name(method=last)}"
 
     def _preset(self, cell: Cell, stage: str) -> tuple[dict[str, Any], str | None]:
         """All settings of a stage as its preset leaves them, defaults included, and the preset's file."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,23 +13,19 @@ import pandas as pd
 
 from dds_lightning.console.reports import Report, table
 from dds_lightning.grid import figures
+from dds_lightning.grid.cells import counted
 from dds_lightning.grid.found import FILE as FOUND
 from dds_lightning.grid.results import PULLS, Results, remember
 from dds_lightning.saving.files import written_whole
 from dds_lightning.saving.run_directory import duration
 from dds_lightning.saving.templates import render
-from dds_lightning.study.paper import DATA_DIFFER
+from dds_lightning.study.paper import DATA_DIFFER, LAYOUTS
 from dds_lightning.study.tables import markdown
 
-PAPERS = {
-    "table1": "Laid out as the paper's table 1.",
-    "table2": "Laid out as the paper's table 2, which is for AntMaze-Large-Diverse. It finds that K matters where D is "
-    "small (no success with K 32 and D 32 or 64) and hardly where D is 128 or more.",
-    "table3": "Laid out as the paper's table 3; its numbers beside a maze are for AntMaze-Large-Diverse. It finds the "
-    "transformer with the diffusion decoder ahead of all other pairs by a wide margin.",
-    "figure5": "Laid out as the paper's figure 5, which has curves and no numbers.",
-    "figure6": "Laid out as the paper's figure 6, which has curves and no numbers; it finds that H hardly matters.",
-}
+COMMANDS = (
+    "The commands of each cell, in their order, make it again by hand in an empty folder; what several cells share is "
+    "listed for each of them. In the folder of the study itself they would replace its work."
+)
 
 
 @dataclass
@@ -81,25 +77,27 @@ def report_study(place: Path, known: Sequence[Path] = ()) -> Report:
 
 
 def _progress(results: Results) -> str:
-    done = int((results.cells["state"] == "done").sum())
-    return f"{done} of {len(results.cells)} cells done, in {duration(results.seconds)} of one core in all"
+    states = results.cells["state"].value_counts()
+    failed = f", {states['failed']} failed" if "failed" in states else ""
+    wall = f" ({duration(results.wall)} of wall time in this folder)" if results.wall else ""
+    done = f"{states.get('done', 0)} of {counted(len(results.cells), 'cell')} done{failed}"
+    return f"{done}, in {duration(results.seconds)} of one core in all{wall}"
 
 
 def _sections(results: Results) -> list[Section]:
     """Everything that the report holds, from its files alone."""
     study, cells = results.study, results.cells[results.cells["state"] == "done"]
-    seeds = f"{len(study['seeds'])} seeds" if len(study["seeds"]) > 1 else f"seed {study['seeds'][0]}"
+    seeds = study["seeds"]
+    over = f", mean ± standard deviation over {len(seeds)} seeds" if len(seeds) > 1 else f" with seed {seeds[0]}"
     opening = [str(study["question"])] if study["question"] else []
-    opening.append(
-        f"Normalised scores of the last checkpoint, mean ± standard deviation over {seeds}; {_progress(results)}."
-    )
+    opening.append(f"Normalised scores of the last checkpoint{over}; {_progress(results)}.")
     if study["scale"] != 1:
         opening.append(f"All budgets are multiplied by {study['scale']:g}: this is a trial, not a result.")
     if study["budget"]:
         stated = duration(60 * study["budget"] * study["scale"])
         opening.append(f"Stated budget: {stated} of one core; spent: {duration(results.seconds)}.")
-    if study["paper"] in PAPERS:
-        opening.append(f"{PAPERS[study['paper']]} {DATA_DIFFER}")
+    if study["paper"] in LAYOUTS:
+        opening.append(f"{LAYOUTS[study['paper']]} {DATA_DIFFER}")
     if cells.empty:
         return [Section("", [*opening, "No cell is done yet."]), *_making(results)]
     sections = [Section("", opening), Section("Scores", [], results.table())]
@@ -107,7 +105,11 @@ def _sections(results: Results) -> list[Section]:
         told = (
             "The best checkpoint was chosen by playing in the test environment while it trained: an optimistic score."
         )
-        sections.append(Section("The best checkpoint, apart", [told], results.table("best")))
+        with_best = set(cells.loc[cells["best"].notna(), "method"])
+        if without := [name for name in cells["method"].unique() if name not in with_best]:
+            told += f" Of {', '.join(map(results.label, without))} there is none: they do not play while they train."
+        watched = replace(results, cells=cells[cells["method"].isin(with_best)])
+        sections.append(Section("The best checkpoint, apart", [told], watched.table("best")))
     if study["paper"] == "figure6" and cells["horizon"].notna().any():
         sections.append(Section("Score over the horizon", [], None, figures.plot_horizon(cells), "horizon"))
     if curves := results.found.curves:
@@ -134,7 +136,9 @@ def _statistics(results: Results) -> list[Section]:
             told += f" Compared on {', '.join(compared)} alone: the other tasks are not finished."
         numbers = comparison.round(2)
         sections.append(Section("Is it real?", [told], numbers, figures.plot_intervals(comparison), "intervals"))
-        sections.append(Section("Performance profiles", [], None, figures.plot_profiles(groups), "profiles"))
+        few = f"The first {figures.MOST} of {len(groups)} settings are drawn; all of them are in the table above."
+        drawn = [few] if len(groups) > figures.MOST else []
+        sections.append(Section("Performance profiles", drawn, None, figures.plot_profiles(groups), "profiles"))
     effects = results.effects()
     if len(effects):
         told = (
@@ -162,15 +166,15 @@ def _making(results: Results) -> list[Section]:
         + f"; {one['machine']}"
         for one in results.found.made()
     ]
-    shown = results.cells[["title", "state", "score", "best", "chosen", "seconds"]].copy()
-    shown = shown if shown["chosen"].any() else shown.drop(columns="chosen")
+    shown = results.cells[["title", "state", "reason", "score", "best", "chosen", "seconds"]].copy()
+    shown = shown.drop(columns=[name for name in ("reason", "chosen") if not shown[name].any()])
     shown["seconds"] = shown["seconds"].map(duration)
     shown = shown.rename(columns={"title": "cell", "seconds": "time, with all it reads"}).round(1)
     shown = shown.dropna(axis=1, how="all")
     commands = [(str(row["title"]), list(row["commands"])) for row in results.cells.to_dict("records")]
     return [
         Section("Every cell", [], shown),
-        Section("How it was made", [*made, f"The whole study: {results.command}"], commands=commands),
+        Section("How it was made", [*made, f"The whole study: {results.command}", COMMANDS], commands=commands),
     ]
 
 

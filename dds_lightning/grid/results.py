@@ -12,8 +12,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from dds_lightning.errors import UserError
-from dds_lightning.grid.file import BASE, PLAYERS
-from dds_lightning.grid.found import Found, check_key, found_elsewhere
+from dds_lightning.grid.cells import BASE, PLAYERS, label, shown
+from dds_lightning.grid.found import Found, check_key, found_elsewhere, one_line
 from dds_lightning.grid.job import NODES
 from dds_lightning.saving.untrusted import TEXT, conform, mapping, parsing, read_json
 from dds_lightning.study.paper import number_of
@@ -24,6 +24,8 @@ CELLS = "cells.json"
 """The cells of a study, in its folder."""
 KNOWN = "known.json"
 """What was found elsewhere, in a study's folder."""
+STATE = "state.json"
+"""How long a study's launches took, and what failed in the last, in its folder."""
 PULLS = 100
 """Evaluation episodes that the curve of `evaluation_curve` goes up to."""
 REMEDY = "run the study again"
@@ -58,6 +60,21 @@ def _cells(place: Path) -> tuple[Mapping[str, Any], dict[str, list[str]]]:
         return read, {cell["key"]: [check_key(key, file) for key in cell["nodes"]] for cell in read["cells"]}
 
 
+def read_state(place: Path) -> tuple[float, dict[str, str]]:
+    """Seconds on the clock that all launches of a study took, and job -> why it failed in the last.
+
+    Raises:
+        UserError: The file is damaged.
+    """
+    file = place / STATE
+    if not file.is_file():
+        return 0.0, {}
+    with parsing(file, "delete it"):
+        form = {"wall": (int, float), "failed": (dict,)}
+        found = conform(read_json(file, 64 * TEXT, root=place), form, str(file))
+        return float(found["wall"]), {key: one_line(str(why)) or "" for key, why in found["failed"].items()}
+
+
 @dataclass(frozen=True, eq=False)
 class Results:
     """What a study has found so far.
@@ -66,10 +83,11 @@ class Results:
         place: The study's folder.
         study: Its file, checked, as plain values.
         command: What made it.
-        cells: A row for each cell: coordinates, `seed`, `state`, `score` (of the last checkpoint), `best` (of the best
-            checkpoint; NaN without one), `chosen` (how), `horizon`, `hold`, `seconds` (of the evaluation and all that
-            it reads), `key`, `commands`.
+        cells: A row for each cell: coordinates, `seed`, `state` (done, failed or open), `reason` (why it failed),
+            `score` (of the last checkpoint), `best` (of the best checkpoint; NaN without one), `chosen` (how),
+            `horizon`, `hold`, `seconds` (of the evaluation and all that it reads), `key`, `commands`.
         found: What the cells are made of.
+        wall: Seconds on the clock of all launches in this folder; 0 where none was.
     """
 
     place: Path
@@ -77,6 +95,7 @@ class Results:
     command: str
     cells: pd.DataFrame
     found: Found
+    wall: float = 0.0
 
     @classmethod
     def read(cls, place: Path) -> Results:
@@ -88,8 +107,9 @@ class Results:
         record, cells = _cells(place)
         with parsing(place / CELLS, REMEDY):
             found = _elsewhere(place, cells) | Found.of_nodes(place.parent / NODES, cells)
-            table = pd.DataFrame([_row(cell, found) for cell in record["cells"]])
-            return cls(place, dict(record["study"]), record["command"], table, found)
+            wall, failed = read_state(place)
+            table = pd.DataFrame([_row(cell, found, failed) for cell in record["cells"]])
+            return cls(place, dict(record["study"]), record["command"], table, found, wall)
 
     @property
     def seconds(self) -> float:
@@ -98,7 +118,7 @@ class Results:
 
     def label(self, name: Any) -> str:
         """What the report calls an axis or a value."""
-        return str(self.study["labels"].get(str(name), PLAYERS[name].title if name in PLAYERS else name))
+        return label(self.study["labels"], name)
 
     def name(self, where: Mapping[str, Any]) -> str:
         """A place in the grid, in words: values that speak for themselves without their axis."""
@@ -148,8 +168,20 @@ class Results:
         done = self.cells.groupby("task")["score"].transform(lambda scores: scores.notna().all())
         return self._groups(self.cells[done]) or found
 
+    def _axes(self) -> list[str]:
+        """Coordinates by which two settings differ."""
+        return [axis for axis in (*self.layout()[0], *self.layout()[1]) if axis != "task"]
+
+    def _first(self, groups: Mapping[str, pd.DataFrame]) -> str | None:
+        """The setting that the others are compared with: the first with the file's reference in it, else the first."""
+        reference = self.study["reference"] or BASE
+        for where in self.cells[self._axes()].drop_duplicates().to_dict("records"):
+            if reference in where.values() and (name := self.name(where)) in groups:
+                return name
+        return next(iter(groups), None)
+
     def _groups(self, cells: pd.DataFrame) -> dict[str, pd.DataFrame]:
-        axes = [axis for axis in (*self.layout()[0], *self.layout()[1]) if axis != "task"]
+        axes = self._axes()
         found: dict[str, pd.DataFrame] = {}
         for chosen, part in cells.groupby(axes, sort=False, dropna=False) if axes else [((), cells)]:
             name = self.name(dict(zip(axes, chosen, strict=True)))
@@ -161,8 +193,7 @@ class Results:
     def comparison(self) -> pd.DataFrame:
         """A row for each setting: interquartile mean with its interval, and how probably it beats the reference."""
         groups, rows = self.groups(), []
-        reference = self.label(self.study["reference"] or BASE)
-        first = next((name for name in groups if name == reference), next(iter(groups), None))
+        first = self._first(groups)
         for name, scores in groups.items():
             middle = interval(scores)
             row = {"setting": name, "runs": scores.size, "IQM": middle.value, "low": middle.low, "high": middle.high}
@@ -213,13 +244,18 @@ class Results:
         return found
 
 
-def _row(cell: Mapping[str, Any], found: Found) -> dict[str, Any]:
+def _row(cell: Mapping[str, Any], found: Found, failed: Mapping[str, str]) -> dict[str, Any]:
     """One row of `Results.cells`."""
-    row = {"task": cell["task"], "method": cell["method"], **cell["place"], "seed": cell["seed"], "key": cell["key"]}
-    row |= {"title": cell["title"], "state": "open", "score": np.nan, "best": np.nan, "chosen": ""}
+    # What pandas cannot group by (lists), or reads as missing (null), stands as text.
+    place = {axis: one if type(one) in (str, int, float) else shown(one) for axis, one in cell["place"].items()}
+    row = {"task": cell["task"], "method": cell["method"], **place, "seed": cell["seed"], "key": cell["key"]}
+    row |= {"title": cell["title"], "state": "open", "reason": "", "score": np.nan, "best": np.nan, "chosen": ""}
     row |= {"horizon": np.nan, "hold": np.nan}
     if (outcome := found.outcomes.get(cell["key"])) is not None:
         row |= {"state": "done", "score": outcome.scores[LAST], "best": outcome.scores.get(BEST, np.nan)}
+    elif cell["key"] in failed:  # the first of its jobs to fail kept the others back
+        first = next(key for key in cell["nodes"] if key in failed)
+        row |= {"state": "failed", "reason": f"{first.partition('-')[0]}: {failed[first]}"}
     works = [found.works[key] for key in cell["nodes"] if key in found.works]
     row["seconds"] = sum(work.seconds for work in works)
     row["commands"] = [work.command for work in works if work.command is not None]
@@ -227,5 +263,5 @@ def _row(cell: Mapping[str, Any], found: Found) -> dict[str, Any]:
         row["chosen"] = work.chosen or row["chosen"]
         if work.horizon is not None:
             row["horizon"] = row["hold"] = work.horizon
-    row["hold"] = cell["settings"].get("evaluate.hold", row["hold"])
+    row["hold"] = cell["settings"].get("evaluate.hold") or row["hold"]
     return row

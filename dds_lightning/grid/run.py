@@ -5,12 +5,15 @@
  OUT/logs/KIND-HASH.txt  what it printed
  OUT/NAME/cells.json     the cells of the study NAME, and the evaluation that each is
  OUT/NAME/known.json     what cells have found elsewhere (--known)
+ OUT/NAME/state.json     wall time of all launches, and why jobs failed in the last
  OUT/NAME/report/        tables, figures, one page, and results.json, from which another folder can go on
 ```
 """
 
 from __future__ import annotations
 
+import shlex
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,14 +23,14 @@ from dds_lightning.console.progress import on_terminal, progress_bar
 from dds_lightning.console.reports import Report
 from dds_lightning.console.terminal import Terminal
 from dds_lightning.envs.pool import available_cores
-from dds_lightning.errors import UserError
-from dds_lightning.grid.engines import ENGINES, Engine, Local, RayTasks, Slurm
-from dds_lightning.grid.file import Cell, Study, find_study, read_study
+from dds_lightning.grid.cells import Cell, Study, counted
+from dds_lightning.grid.engines import Engine, Local, RayTasks, Slurm, refuse_request
+from dds_lightning.grid.file import find_study, read_study
 from dds_lightning.grid.found import Found, found_elsewhere
-from dds_lightning.grid.job import NODES
+from dds_lightning.grid.job import LOGS, NODES
 from dds_lightning.grid.loop import Progress, run_nodes
 from dds_lightning.grid.nodes import Node, in_order, needed, plan
-from dds_lightning.grid.results import CELLS, KNOWN
+from dds_lightning.grid.results import CELLS, KNOWN, STATE, read_state
 from dds_lightning.saving.run_directory import Done, duration, finished, locked, write_json
 
 
@@ -40,7 +43,7 @@ class Asked:
     engine: str = "local"
     workers: int | None = None
     scale: float = 1.0
-    cpus: float = 1
+    cpus: int = 1
     gpus: float = 0
     minutes: int = 240
     plan_only: bool = False
@@ -56,12 +59,9 @@ def run_study(asked: Asked) -> Report:
     Raises:
         UserError: A study file or a setting that cannot work, found before anything runs.
     """
+    refuse_request(asked.engine, asked.workers, asked.cpus, asked.gpus, asked.minutes)
     path = find_study(asked.file)
     study = read_study(path, asked.scale)
-    if asked.engine not in ENGINES:
-        raise UserError(f"--engine is {asked.engine}, expected one of {', '.join(ENGINES)}")
-    if asked.workers is not None and asked.workers < 1:
-        raise UserError(f"--workers is {asked.workers}, expected at least 1")
     cells = plan(study)
     nodes = in_order(node for _, node in cells.values())
     place = asked.out / (path.stem if study.scale == 1 else f"{path.stem}@{study.scale:g}")
@@ -72,7 +72,11 @@ def run_study(asked: Asked) -> Report:
         write_json(place / CELLS, _table(study, cells, asked))
         if known.outcomes:
             known.save(place / KNOWN)
-        failed = do_nodes(asked, nodes, known)
+        before, began, failed = read_state(place)[0], time.monotonic(), dict[str, str]()
+        try:
+            failed = do_nodes(asked, nodes, known)
+        finally:
+            write_json(place / STATE, {"wall": round(before + time.monotonic() - began, 1), "failed": failed})
     from dds_lightning.grid.report import report_study
 
     report = report_study(place)
@@ -80,8 +84,8 @@ def run_study(asked: Asked) -> Report:
     told = [f"{nodes[key].title}: {reason}" for key, reason in failed.items() if not reason.startswith("not done")]
     report.data["failed"] = why
     if failed:
-        report.text += [f"{len(why)} of {len(cells)} cells failed; the same command tries them again:", *told]
-        report.text.append(f"what each of them printed is in {asked.out / 'logs'}")
+        report.text += [f"{counted(len(why), 'cell')} of {len(cells)} failed; the same command tries again:", *told]
+        report.text.append(f"what each job printed is in {asked.out / LOGS}, a file for each")
         report.status = 1
     return report
 
@@ -106,7 +110,7 @@ def do_nodes(asked: Asked, nodes: Mapping[str, Node], known: Found) -> dict[str,
             progress.past[node.kind].append(work.seconds)
     todo = needed(nodes, done)
     progress.total = len(todo)
-    console.print(f"{len(nodes)} jobs, {len(done)} of them done before, {len(todo)} to do")
+    console.print(f"{counted(len(nodes), 'job')}, {len(done)} of them done before, {len(todo)} to do")
     if not todo:
         return {}
     engine = _engine(asked)
@@ -130,7 +134,7 @@ def _engine(asked: Asked) -> Engine:
     if asked.engine == "ray":
         return RayTasks(asked.workers, asked.cpus, asked.gpus)
     if asked.engine == "slurm":
-        return Slurm(asked.out / "slurm", asked.workers, int(asked.cpus), int(asked.gpus), asked.minutes)
+        return Slurm(asked.out / "slurm", asked.workers, asked.cpus, asked.gpus, asked.minutes)
     return Local(asked.workers or available_cores())
 
 
@@ -140,9 +144,9 @@ def _table(study: Study, cells: Mapping[str, tuple[Cell, Node]], asked: Asked) -
         {"key": key, **asdict(cell), "nodes": list(in_order([node])), "title": cell.name()}
         for key, (cell, node) in cells.items()
     ]
-    scale = "" if study.scale == 1 else f" --scale={study.scale:g}"
-    command = f"dds study run {asked.file} --out={asked.out}{scale}"
-    return {"format": 1, "study": asdict(study), "cells": rows, "command": command}
+    words = ["dds", "study", "run", asked.file, f"--out={asked.out}"]
+    words += [] if study.scale == 1 else [f"--scale={study.scale:g}"]
+    return {"format": 1, "study": asdict(study), "cells": rows, "command": shlex.join(words)}
 
 
 def _finished(asked: Asked, nodes: Mapping[str, Node]) -> dict[str, Done]:
@@ -160,5 +164,5 @@ def _planned(
         kinds[node.kind] = kinds.get(node.kind, 0) + 1
     budget = f"; stated budget: {duration(60 * study.budget * study.scale)} of one core" if study.budget else ""
     told = ", ".join(f"{count} {kind}" for kind, count in kinds.items()) or "nothing"
-    lines: list[Any] = [f"{study.title}: {len(cells)} cells{budget}", f"to do: {told}"]
+    lines: list[Any] = [f"{study.title}: {counted(len(cells), 'cell')}{budget}", f"jobs to do: {told}"]
     return Report({"title": study.title, "cells": len(cells), "jobs": kinds, "done_before": len(done)}, lines)

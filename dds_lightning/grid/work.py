@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from dds_lightning.agent import DDSAgent
 from dds_lightning.configs import known_as
-from dds_lightning.errors import UserError
-from dds_lightning.grid.file import PLAYERS
+from dds_lightning.grid.cells import PLAYERS
 from dds_lightning.grid.nodes import arguments
 from dds_lightning.rollout.actors import Contestant
 from dds_lightning.rollout.play import rollout
@@ -37,8 +37,9 @@ def collect_data(settings: Facts, how: Facts, reads: Reads, folder: Path, resumi
 
     task = get_task(settings["task"])
     steps, seed = int(settings["steps"]), int(settings["seed"])
-    made = collect(task, steps, seed, folder, 1, dataset_id=task.file_name, overwrite=True)
-    return {"data": made, "command": f"dds data collect {task.name} --steps={steps} --seed={seed}"}
+    made = collect(task, steps, seed, folder, 1, overwrite=True)
+    words = ["data", "collect", task.name, f"--steps={steps}", f"--seed={seed}", f"--out={folder}"]
+    return {"data": made, "command": _by_hand(words, folder)}
 
 
 def relabel(settings: Facts, how: Facts, reads: Reads, folder: Path, resuming: bool) -> Facts:
@@ -70,7 +71,7 @@ def train(settings: Facts, how: Facts, reads: Reads, folder: Path, resuming: boo
     fitted = command(stage, [*words, *resume])().data
     # Where nobody watches in the environment, the preset itself keeps the best, by a loss.
     made = trained(fitted, takes_best="watch" not in settings)
-    return {**made, "command": shlex.join(["dds", stage, *map(known_as, words)])}
+    return {**made, "command": _by_hand([stage, *map(known_as, words)], folder)}
 
 
 def evaluate(settings: Facts, how: Facts, reads: Reads, folder: Path, resuming: bool) -> Facts:
@@ -84,25 +85,30 @@ def evaluate(settings: Facts, how: Facts, reads: Reads, folder: Path, resuming: 
         ends[BEST] = {**last, method.stages[-1]: str(final.outputs["best"])}
     names = ("selection", "temperature", "noise_scale", "hold")
     acting = {name: settings[name] for name in names if name in settings}
-    players = []
+    players, commands = [], []
     for name, checkpoints in ends.items():
         actor = method.play(checkpoints)
         if isinstance(actor, DDSAgent):
             actor = actor.variant(**acting, seed=settings["seed"])
-        elif how["asked"]:
-            raise UserError(
-                f"evaluate.{how['asked'][0]} is for agents over skills, which {method.title} has not: leave it out"
-            )
         players.append(Contestant(name, actor, settings["episodes"]))
+        words = ["evaluate", *([f"--skill={checkpoints['skill']}"] if "skill" in checkpoints else [])]
+        words += [f"--policy={checkpoints[method.stages[-1]]}", *(f"--{key}={value}" for key, value in acting.items())]
+        words += [f"--task={task.name}", f"--episodes={settings['episodes']}", f"--seed={settings['seed']}"]
+        commands.append(_by_hand(words, folder))
     result = rollout(task, players, seed=settings["seed"], workers=0)
     result.save(folder)
     rows = json.loads(result.summary().round(4).to_json(orient="records"))
-    flags = [f"--skill={last['skill']}"] if "skill" in last else []
-    flags.append(f"--policy={last[method.stages[-1]]}")
-    flags += [f"--{name}={value}" for name, value in acting.items()]
-    told = " ".join(["dds evaluate", *flags, f"--task={task.name}", f"--episodes={settings['episodes']}"])
-    told += f" --seed={settings['seed']}"
-    return {"episodes": folder / "episodes.parquet", "results": rows, "command": told}
+    return {"episodes": folder / "episodes.parquet", "results": rows, "command": " && ".join(commands)}
+
+
+def _by_hand(words: Sequence[str], folder: Path) -> str:
+    """The line that does the same in any folder: places of the study's are named from its own.
+
+    Args:
+        words: What follows `dds`.
+        folder: Of the job, OUT/nodes/KEY.
+    """
+    return shlex.join(["dds", *(word.replace(f"{folder.parents[1]}{os.sep}", "") for word in words)])
 
 
 def _spec(reads: Reads) -> str:

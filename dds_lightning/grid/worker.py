@@ -14,10 +14,9 @@ import queue
 import signal
 import sys
 import threading
-from pathlib import Path
 
 from dds_lightning.console.interrupts import Interrupted, caught
-from dds_lightning.grid.job import LOGS, do
+from dds_lightning.grid.job import do_logged
 
 
 def main() -> None:
@@ -28,10 +27,7 @@ def main() -> None:
         threading.Thread(target=_read, args=(jobs,), daemon=True).start()
         try:
             while line := jobs.get():
-                job = json.loads(line)
-                _log_to(Path(job["root"]) / LOGS / f"{job['key']}.txt")
-                answer = do(job)
-                answers.write(json.dumps(answer) + "\n")
+                answers.write(json.dumps(do_logged(json.loads(line))) + "\n")
                 answers.flush()
         except Interrupted:
             os._exit(143)
@@ -42,12 +38,3 @@ def _read(jobs: queue.Queue[str]) -> None:
     for line in sys.stdin:
         jobs.put(line)
     os.kill(os.getpid(), signal.SIGTERM)
-
-
-def _log_to(path: Path) -> None:
-    """Send all output to a job's log, also that of child processes."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-    for stream in (1, 2):
-        os.dup2(file, stream)
-    os.close(file)

@@ -45,23 +45,24 @@ def evaluate(
     Raises:
         UserError: There is no agent or no such checkpoint, or it does not fit the task or the selection.
     """
-    if (directory is None) == (skill is None):
+    if directory is not None and policy is not None and skill is None:
+        raise UserError(f"--policy is {policy} without --skill: give both")
+    if (directory is None) == (skill is None and policy is None):
         raise UserError(
             f"the run is {directory} and --skill is {skill}: give a run or a published checkpoint, or the checkpoints "
             "of trainings, --skill SKILL.ckpt --policy POLICY.ckpt"
         )
-    if policy is not None and skill is None:
-        raise UserError(f"--policy is {policy} without --skill: give both")
-    places = {LAST: Path(policy or skill)} if skill else _places(Path(directory or ""), checkpoint)
+    loose = directory is None  # raw actions have a policy alone
+    places = _places(directory, checkpoint) if directory is not None else {LAST: Path(policy or skill or "")}
     first = next(iter(places.values()))
-    wanted = loose_task(task, policy, skill) if skill else loose_task(task, str(first))
+    wanted = loose_task(task, policy, skill) if loose else loose_task(task, str(first))
     if wanted is None:
         raise UserError(f"{first} does not say which task it is for: give --task; `dds tasks` lists them")
     count = episodes_to_play(wanted, episodes)
     chosen = {"noise_scale": noise_scale, "hold": hold}
     acting: dict[str, Any] = {"seed": seed, **{name: value for name, value in chosen.items() if value is not None}}
     agents = {
-        kind: loose_agent(skill, policy, wanted, **acting) if skill else DDSAgent.load(place, **acting)
+        kind: loose_agent(skill, policy, wanted, **acting) if loose else DDSAgent.load(place, **acting)
         for kind, place in places.items()
     }
     for kind, agent in agents.items():

@@ -10,6 +10,18 @@ from collections.abc import Mapping
 Number = tuple[float, float | None]
 """Mean and standard deviation; None where only a mean is printed."""
 
+LAYOUTS = {
+    "table1": "Laid out as the paper's table 1.",
+    "table2": "Laid out as the paper's table 2, which is for AntMaze-Large-Diverse. It finds that K matters where D is "
+    "small (no success with K 32 and D 32 or 64) and hardly where D is 128 or more.",
+    "table3": "Laid out as the paper's table 3; its numbers beside a maze are for AntMaze-Large-Diverse. It finds the "
+    "transformer with the diffusion decoder ahead of all other pairs by a wide margin.",
+    "figure5": "Laid out as the paper's figure 5, which has curves and no numbers.",
+    "figure6": "Laid out as the paper's figure 6, which has curves and no numbers; it finds that H hardly matters.",
+}
+"""Table or figure -> what a report that is set beside it says of it."""
+SHORT = {"Decision Diffuser": "DD", "Diffusion-QL": "DQL"}
+"""What the paper's table 1 calls methods that have another title here."""
 DATA_DIFFER = (
     "The paper's numbers are for other data (D4RL's, in D4RL's physics) and longer trainings: they show which pattern "
     "to expect, not which value."
@@ -105,7 +117,7 @@ def number_of(table: str, task: str, method: str, settings: Mapping[str, object]
     """
     task = task.partition("@")[0].partition("?")[0]
     if table == "table1":
-        return TABLE1.get(task, {}).get(method)
+        return TABLE1.get(task, {}).get(SHORT.get(method, method))
     dimension, skills = settings.get("skill.model.skill_dim"), settings.get("skill.model.num_skills")
     if table == "table2" and isinstance(dimension, int) and isinstance(skills, int):
         return TABLE2.get((dimension, skills))

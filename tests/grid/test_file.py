@@ -4,7 +4,7 @@ import pytest
 import yaml
 
 from dds_lightning.errors import UserError
-from dds_lightning.grid.file import packaged_studies, read_study
+from dds_lightning.grid.file import find_study, packaged_studies, read_study
 from dds_lightning.grid.nodes import in_order, plan
 
 TASK = "pointmaze-umaze-diverse"
@@ -74,8 +74,6 @@ def test_scale_divides_every_budget(tmp_path):
 
 @pytest.mark.parametrize("name", packaged_studies())
 def test_packaged_studies_can_be_planned(name):
-    from dds_lightning.grid.file import find_study
-
     found = read_study(find_study(name))
     assert found.budget
     assert found.seeds == (0, 1, 2)
@@ -113,14 +111,77 @@ def test_packaged_studies_can_be_planned(name):
         ({"variants": {"base": {"skill.model.skill_dim": 32}}}, "base is there without being named"),
         ({"gird": {}}, r"gird is no setting of a study: did you mean grid\?"),
         ({"seeds": 3}, "seeds is 3, expected a list"),
-        ({"columns": ["skill.model.num_skills"]}, "columns names skill.model.num_skills, which the study has not"),
+        (
+            {"columns": ["skill.model.num_skills"]},
+            "columns names skill.model.num_skills, which the study does not have",
+        ),
         ({"watch": -1}, "watch is -1, expected 0"),
+        ({"settings": {"evaluate.episodes": 0}}, "evaluate.episodes is 0, expected a whole number of at least 1"),
+        ({"settings": {"evaluate.hold": 5.0}}, r"evaluate.hold is 5\.0, expected a whole number"),
+        ({"settings": {"evaluate.hold": 11}}, "evaluate.hold is 11, expected at most 10, the steps that skills last"),
+        ({"settings": {"evaluate.temperature": 0}}, "evaluate.temperature is 0, expected a number above 0"),
+        ({"settings": {"evaluate.noise_scale": float("inf")}}, "noise_scale is inf, expected a number of at least 0"),
+        ({"methods": ["clone"], "settings": {"evaluate.hold": 5}}, "evaluate.hold is for agents over skills, .* BC "),
+        ({"settings": {"data.steps": 0.5}}, r"data.steps is 0\.5, expected a whole number of at least 1"),
+        ({"settings": {"data.seed": -1}}, "data.seed is -1, expected 0 to"),
+        ({"settings": {"data.step": 5}}, "data.step is no setting .*did you mean data.steps"),
+        ({"data": "local:x", "settings": {"data.steps": 5}}, "data.steps is for data that are collected, and data is"),
+        ({"budget": -1}, "budget is -1, expected core-minutes, more than 0"),
+        ({"paper": "table4"}, "paper is table4, .*did you mean table"),
+        ({"reference": "iql"}, "reference names iql, which the study does not have, expected some of dds"),
+        ({"labels": {"K": "skills"}}, "labels names K, which the study does not have"),
+        ({"rows": ["task"], "columns": ["task"]}, "rows and columns name task twice"),
+        ({"tasks": [["a"]]}, r"tasks holds \['a'\], expected names"),
+        ({"methods": [["dds"]]}, r"methods holds \['dds'\], expected names"),
+        (
+            {"grid": {"policy.model.alpha": [1, 2]}, "labels": {1: "x", 2: "x"}},
+            "of policy.model.alpha, 1 and 2 are both called x",
+        ),
+        ({"variants": {"a": {"skill.model.skill_dim": 32}}, "labels": {"base": "a"}}, "base and a are both called a"),
+        ({"settings": {"skill.model.num_skills": 1}}, "skill.model.num_skills is 1, expected at least 2"),
+        ({"settings": {"policy.model.lr": -1e-3}}, r"policy.model.lr is -0\.001, expected positive"),
+        ({"grid": {"skill.data.stride": [1, 0]}}, "skill.data.stride: got 0, expected at least 1"),
+        ({"settings": {"policy.data.gamma": 2.0}}, r"policy.data.gamma is 2\.0, expected a discount in"),
+        ({"methods": ["idql"], "settings": {"idql.model.lr": 0.0}}, r"idql.model.lr is 0\.0, expected positive"),
     ],
 )
 def test_a_wrong_study_is_answered_in_one_sentence(tmp_path, keys, message):
     with pytest.raises(UserError, match=message) as told:
         plan(study(tmp_path, **keys))
     assert "\n" not in str(told.value)
+
+
+def test_a_key_that_stands_twice_is_refused_with_its_line(tmp_path):
+    path = tmp_path / "study.yaml"
+    path.write_text(yaml.safe_dump(TINY) + "grid:\n  skill.model.lr: [0.1]\n  skill.model.lr: [0.2]\n")
+    with pytest.raises(UserError, match=r"skill\.model\.lr stands twice, the second time in line 6"):
+        read_study(path)
+
+
+def test_numbers_that_yaml_reads_as_text_are_numbers(tmp_path):
+    found = study(tmp_path, settings={"data.steps": "2e5", "policy.model.lr": "1e-3"})
+    assert found.settings == {"data.steps": 200_000, "policy.model.lr": 0.001}
+
+
+def test_a_training_is_titled_by_what_it_depends_on(tmp_path):
+    found = study(
+        tmp_path,
+        grid={"skill.model.num_skills": [4, 8], "policy.model.alpha": [1.0, 3.5]},
+        variants={"held": {"evaluate.hold": 5}, "wide": {"policy.model.hidden_dims": [64, 64]}},
+    )
+    titles = {node.title for node in nodes(found).values() if node.kind in ("skill", "policy")}
+    assert {title for title in titles if title.startswith("skill")} == {
+        f"skill {TASK}, num_skills {count}, seed 0" for count in (4, 8)
+    }
+    assert f"policy {TASK}, DDS, num_skills 4, alpha 1, seed 0" in titles
+    assert f"policy {TASK}, DDS, num_skills 8, alpha 3.5, variant wide, seed 0" in titles
+    assert len(titles) == 2 + 8
+
+
+@pytest.mark.parametrize("name", ["no/such/table2.yaml", "table2.yaml", "./table2"])
+def test_a_file_that_is_not_there_is_never_taken_for_a_packaged_study(name):
+    with pytest.raises(UserError, match=f"there is no file {name}, and the packaged studies are baselines, figure5"):
+        find_study(name)
 
 
 def test_wrong_scales_and_files_are_refused(tmp_path, dds):

@@ -95,6 +95,26 @@ def test_a_curve_of_online_training_survives_the_file(tmp_path):
         (lambda v: v | {"nodes": {KEY: {"seconds": 1, "command": ["dds"]}}}, "command is"),
         (lambda v: v | {"cells": {KEY: {"scores": {}, "episodes": []}}}, "last is"),
         (lambda v: v | {"curves": {KEY: {"a": [1]}}}, "a curve has other columns"),
+        (
+            lambda v: v | {"curves": {KEY: {"env_steps": [1], "value": [None]}}},
+            r"has \[None\], expected a list",
+        ),
+        (lambda v: v | {"curves": {KEY: {"env_steps": [1], "value": [1, 2]}}}, "is damaged"),
+        (lambda v: v | {"curves": {KEY: [1]}}, "holds a list"),
+        (
+            lambda v: v | {"cells": {KEY: {"scores": {"last": 1.0}, "episodes": []}}},
+            r"has \[\], expected a list",
+        ),
+        (lambda v: v | {"cells": {KEY: {"scores": {"last": 1.0}, "episodes": [[1]]}}}, "expected a list of finite"),
+        (lambda v: v | {"cells": {KEY: {"scores": {"last": 1.0, "best": "high"}, "episodes": [1]}}}, "best is 'high'"),
+        (lambda v: v | {"cells": {KEY: {"scores": [1], "episodes": [1]}}}, "scores is"),
+        (lambda v: v | {"cells": {"policy-0123456789abcdef": {}}}, "is no name of a job"),
+        (lambda v: v | {"made": [{}]}, "versions is"),
+        (lambda v: v | {"made": [{"versions": {"torch": 2}, "machine": "x"}]}, "torch is '2'"),
+        (
+            lambda v: v | {"nodes": {KEY: {"seconds": 1, "chosen": "", "made": 3}}},
+            "damaged: list index out of range",
+        ),
         (lambda v: [], "holds a list"),
     ],
 )
@@ -104,6 +124,23 @@ def test_a_damaged_file_is_told_in_a_sentence(tmp_path, change, told):
     (tmp_path / FILE).write_text(json.dumps(change(value)))
     with pytest.raises(UserError, match=told):
         Found.load(tmp_path / FILE)
+
+
+def test_a_damaged_report_is_refused_at_once_and_nothing_is_remembered(tmp_path):
+    place, damaged = made(tmp_path / "a", left_out=range(1, 12)), tmp_path / FILE
+    report_study(place)
+    value = json.loads((place / "report" / FILE).read_text())
+    key = next(iter(value["cells"]))
+    value["cells"][key]["episodes"] = []
+    damaged.write_text(json.dumps(value))
+    for call in (
+        lambda: report_study(place, [damaged]),
+        lambda: run_study(Asked(str(tmp_path / "a" / "mine.yaml"), tmp_path / "b", known=[damaged])),
+    ):
+        with pytest.raises(UserError, match="expected a list of finite numbers"):
+            call()
+    assert not (place / "known.json").exists()
+    assert not (tmp_path / "b").exists()
 
 
 def test_results_of_another_study_are_refused(tmp_path):

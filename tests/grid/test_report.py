@@ -1,6 +1,7 @@
 """The report of a study, from results made up by hand: its tables, its intervals, its page."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,12 @@ import yaml
 from rich.console import Console
 
 from dds_lightning.errors import UserError
+from dds_lightning.grid import figures
 from dds_lightning.grid.file import read_study
 from dds_lightning.grid.job import MADE, NODES
 from dds_lightning.grid.nodes import in_order, plan
 from dds_lightning.grid.report import report_study
-from dds_lightning.grid.results import Results
+from dds_lightning.grid.results import STATE, Results
 from dds_lightning.grid.run import CELLS, Asked, _table
 from dds_lightning.rollout.result import RolloutResult
 from dds_lightning.saving.run_directory import MARKER, RunDirectory, write_json
@@ -69,7 +71,8 @@ def made(tmp_path, best=False, left_out=(), **keys):
     root = tmp_path / NODES
     directory = RunDirectory(root, Console(quiet=True))
     for index, (cell, node) in enumerate(cells.values()):
-        score = SCORES.get(tuple(cell.place.values()), (1, 2, 3))[cell.seed]
+        score = {str(place): scores for place, scores in SCORES.items()}.get(str(tuple(cell.place.values())), (1, 2, 3))
+        score = score[cell.seed]
         work = evaluation({"last": score, **({"best": score + 1} if best else {})})
         for one in in_order([node]).values():
             if one.kind == "evaluate" and index in left_out:
@@ -175,6 +178,80 @@ def test_a_study_that_is_not_finished_has_a_report_of_what_there_is(tmp_path):
     empty = made(tmp_path / "empty", left_out=range(12))
     report_study(empty)
     assert "No cell is done yet." in (empty / "report" / "report.md").read_text()
+
+
+def test_values_that_are_lists_or_null_have_rows_of_their_own(tmp_path):
+    grid = {"policy.model.hidden_dims": [[64], [64, 64]], "skill.model.codebook_ema": [None, 0.5]}
+    place = made(tmp_path, grid=grid, rows=[], columns=[], labels={"skill.model.codebook_ema": "EMA", "[64]": "narrow"})
+    results = Results.read(place)
+    assert results.cells["skill.model.codebook_ema"].unique().tolist() == ["null", 0.5]
+    assert list(results.groups())[:2] == [f"policy.model.hidden_dims narrow, EMA {value}" for value in ("null", 0.5)]
+    assert len(results.groups()) == 4
+    report_study(place)
+    assert "| narrow | 2.0 ± 1.0 | 2.0 ± 1.0 |" in (place / "report" / "report.md").read_text()
+
+
+def test_a_failed_cell_is_shown_with_its_reason_and_launches_with_their_wall_time(tmp_path):
+    place = made(tmp_path, left_out=(1, 2), seeds=[0])
+    keys = list(Results.read(place).cells["key"])
+    nodes = {cell["key"]: cell["nodes"] for cell in json.loads((place / CELLS).read_text())["cells"]}
+    skill = next(key for key in nodes[keys[1]] if key.startswith("skill-"))
+    failed = {skill: "no | memory", keys[1]: "not done, because 'skill' failed", keys[0]: "earlier"}
+    write_json(place / STATE, {"wall": 125.0, "failed": failed})
+    cells = Results.read(place).cells
+    assert cells["state"].tolist() == ["done", "failed", "open", "done"]
+    assert cells["reason"].tolist() == ["", "skill: no | memory", "", ""]
+    report_study(place)
+    text = (place / "report" / "report.md").read_text()
+    assert "2 of 4 cells done, 1 failed, in " in text
+    assert "(2 min 5 s of wall time in this folder)" in text
+    assert "| failed | skill: no \\| memory |" in text
+
+
+def test_table_1_has_tasks_as_rows_and_the_papers_numbers_of_every_method(tmp_path):
+    names = ["dds", "clone", "dd", "dql"]
+    layout = {"paper": "table1", "rows": ["task"], "columns": ["method"], "labels": {}, "grid": {}, "seeds": [0]}
+    place = made(tmp_path, tasks=["hopper-medium-expert", "antmaze-large-diverse"], methods=names, **layout)
+    table = Results.read(place).table().set_index("task")
+    assert list(table.index) == ["hopper-medium-expert", "antmaze-large-diverse"]
+    assert table.loc["hopper-medium-expert", "Decision Diffuser (paper)"] == "111.8"
+    assert table.loc["antmaze-large-diverse", "Diffusion-QL (paper)"] == "56.6"
+    assert table.loc["antmaze-large-diverse", "DDS (paper)"] == "82.6 ± 0.6"
+    assert table.loc["hopper-medium-expert", "DDS"] == "1.0"
+
+
+def test_it_is_told_of_which_methods_there_is_no_best_checkpoint(tmp_path):
+    place = made(tmp_path, methods=["dds", "clone"], grid={}, rows=["method"], columns=[], labels={}, seeds=[0])
+    results = Results.read(place)
+    found = results.found.outcomes
+    ours = results.cells.set_index("method")["key"]["dds"]
+    outcomes = {**found, ours: replace(found[ours], scores={"last": 1.0, "best": 2.0})}
+    replace(results.found, outcomes=outcomes).save(place / "known.json")
+    (place.parent / NODES / ours / MARKER).unlink()
+    report_study(place)
+    section = (place / "report" / "report.md").read_text().split("## The best checkpoint, apart")[1].split("##")[0]
+    assert "Of BC there is none: they do not play while they train." in section
+    assert "| DDS | 2.0 |" in section
+    assert "| BC |" not in section
+
+
+def test_settings_that_are_not_drawn_are_told(tmp_path):
+    grid = {"skill.model.num_skills": list(range(4, 18))}
+    report_study(made(tmp_path, grid=grid, rows=[], columns=[], labels={}, seeds=[0]))
+    text = (tmp_path / "mine" / "report" / "report.md").read_text()
+    assert "The first 12 of 14 settings are drawn; all of them are in the table above." in text
+
+
+def test_the_band_of_figure_5_is_the_standard_deviation_within_0_and_100():
+    tables = [pd.DataFrame({"env_steps": [0.0, 10.0], "value": [0.0, value]}) for value in (80.0, 100.0)]
+    (band,) = figures.plot_online({"x": tables}).axes[0].collections
+    last = band.get_paths()[0].vertices
+    last = last[last[:, 0] == 10.0][:, 1]
+    assert last.min() == pytest.approx(90 - 200**0.5)  # over 80 and 100, with ddof 1
+    assert last.max() == 100.0
+    returns = [table.assign(value=-table["value"]) for table in tables]
+    (band,) = figures.plot_online({"x": returns}).axes[0].collections
+    assert band.get_paths()[0].vertices[:, 1].min() == pytest.approx(-90 - 200**0.5)
 
 
 @pytest.mark.parametrize(("horizon", "hold"), [(10, None), (20, 5)])
