@@ -45,12 +45,12 @@ def check(study: Study) -> None:
     if study.watch < 0:
         raise UserError(f"watch is {study.watch}, expected 0 (no evaluation while training) or more")
     if study.paper and study.paper not in LAYOUTS:
-        near = did_you_mean(study.paper, LAYOUTS) or f", expected one of {', '.join(LAYOUTS)}"
-        raise UserError(f"paper is {study.paper}, which has no numbers or layout here{near}")
+        near = did_you_mean(study.paper, LAYOUTS) or f": {', '.join(LAYOUTS)}"
+        raise UserError(f"paper is {study.paper}, expected a table or figure of the paper{near}")
     for name, departure in study.variants.items():
         if not isinstance(departure, dict) or not departure or name == BASE:
             raise UserError(
-                f"variants: {name} is {departure!r}, expected settings; {BASE} is there without being named"
+                f"variants: {name} is {departure!r}, expected settings; {BASE} is added without being named"
             )
     trained = {stage for method in study.methods for stage in PLAYERS[method].stages}
     for key, values in _asked(study).items():
@@ -66,16 +66,16 @@ def _check_lists(study: Study) -> None:
     lists = {"tasks": study.tasks, "methods": study.methods, "seeds": study.seeds, **study.grid}
     for name, values in lists.items():
         if not isinstance(values, list | tuple) or not values:
-            raise UserError(f"{name} is {values!r}, expected a list of one or more: the grid would be empty")
+            raise UserError(f"{name} is {values!r}, expected a list with at least one value: the grid would be empty")
         if twice := [value for index, value in enumerate(values) if value in values[:index]]:
-            raise UserError(f"{name} holds {twice[0]!r} twice: the same cells would run twice")
+            raise UserError(f"{name} lists {twice[0]!r} twice: the same cells would run twice")
     for name, texts in {name: getattr(study, name) for name in ("tasks", "methods", "rows", "columns")}.items():
         for one in texts:
             if not isinstance(one, str):
-                raise UserError(f"{name} holds {one!r}, expected names")
+                raise UserError(f"{name} lists {one!r}, expected names")
     for seed in study.seeds:
         if not _is_whole(seed):
-            raise UserError(f"seeds holds {seed!r}, expected whole numbers")
+            raise UserError(f"seeds lists {seed!r}, expected whole numbers")
         refuse_seed("seeds", seed)
     for method in study.methods:
         if method not in PLAYERS:
@@ -99,7 +99,7 @@ def _check_tasks(study: Study) -> None:
     for name, given in study.task_settings.items():
         if name not in study.tasks:
             near = did_you_mean(str(name), study.tasks) or f", expected some of {', '.join(study.tasks)}"
-            raise UserError(f"task_settings: {name} is no task of this study{near}")
+            raise UserError(f"task_settings: {name} is not a task of this study{near}")
         if not isinstance(given, dict) or not given:
             raise UserError(f"task_settings: {name} is {given!r}, expected settings, STAGE.KEY: value")
 
@@ -151,7 +151,7 @@ def _check_setting(key: str, value: Any, trained: set[str]) -> None:
     if room in ("data", "evaluate"):
         if key not in SETTINGS:
             near = did_you_mean(key, SETTINGS) or f", expected some of {', '.join(SETTINGS)}"
-            raise UserError(f"{key} is no setting of the data or the evaluation{near}")
+            raise UserError(f"{key} is not a setting of the data or the evaluation{near}")
         allowed, expected = SETTINGS[key]
         if not allowed(value):
             raise UserError(f"{key} is {value!r}, expected {expected}")
@@ -159,10 +159,10 @@ def _check_setting(key: str, value: Any, trained: set[str]) -> None:
     if room not in STAGES or not name:
         known = [f"{stage}.{one}" for stage in trained for one in options(STAGES[stage])]
         near = did_you_mean(key, known) or f": write STAGE.KEY with a stage of {', '.join(sorted(trained))}"
-        raise UserError(f"{key} is no setting{near}")
+        raise UserError(f"{key} is not a setting{near}")
     if room not in trained:
         raise UserError(
-            f"{key} is a setting of {room}, which no method of this study trains ({', '.join(sorted(trained))})"
+            f"{key} is a setting of {room}, but the methods of this study train {', '.join(sorted(trained))}"
         )
     if name in OURS:
         raise UserError(f"{key} is set by the study itself: leave it out")

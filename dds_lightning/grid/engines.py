@@ -69,8 +69,8 @@ class Local:
                 return answer
             self._workers.remove(worker)
             status = worker.process.wait()
-        died = f"its process died {TRIES} times, the last time with status {status}"
-        return {"seconds": 0.0, "error": f"{died}; most likely there is too little memory: ask for fewer --workers"}
+        died = f"its process died {TRIES} times, last with status {status}"
+        return {"seconds": 0.0, "error": f"{died}; most likely memory ran out: ask for fewer --workers"}
 
     def _worker(self) -> _Worker:
         try:
@@ -212,7 +212,7 @@ class Slurm:
             self._executor = submitit.AutoExecutor(folder / "%j", cluster=cluster)
         except RuntimeError as error:
             raise UserError(
-                f"--engine is slurm, and submitit finds no Slurm here ({error}): run it on a login node"
+                f"--engine is slurm, but submitit finds no Slurm here ({error}): run it on a login node"
             ) from None
         self._executor.update_parameters(
             timeout_min=minutes, cpus_per_task=cpus, gpus_per_node=int(gpus), name="dds-study"

@@ -88,7 +88,7 @@ def read_study(path: Path, scale: float = 1.0) -> Study:
     for key, value in found.items():
         if key not in _KEYS:
             near = did_you_mean(str(key), _KEYS) or f", expected some of {', '.join(_KEYS)}"
-            raise UserError(f"{path}: {key} is no setting of a study{near}")
+            raise UserError(f"{path}: {key} is not a setting of a study{near}")
         if not isinstance(value, _KEYS[key]) or isinstance(value, bool):
             raise UserError(f"{path}: {key} is {value!r}, expected a {_KEYS[key][0].__name__}")
     for key in ("title", "tasks"):
@@ -122,7 +122,7 @@ def _refuse_doubled(node: Any, path: Path) -> None:
         keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
         if twice := [key for index, key in enumerate(keys) if key in keys[:index]]:
             line = next(key for key, _ in reversed(node.value) if key.value == twice[0]).start_mark.line + 1
-            raise UserError(f"{path}: {twice[0]} stands twice, the second time in line {line}: leave one out")
+            raise UserError(f"{path}: {twice[0]} is given twice, the second time in line {line}: leave one out")
     for inner in node.value if isinstance(node, yaml.CollectionNode) else ():
         for one in inner if isinstance(inner, tuple) else (inner,):
             _refuse_doubled(one, path)

@@ -209,7 +209,7 @@ def check_key(key: str, file: Path, form: re.Pattern[str] = KEY) -> str:
         UserError: It is something else.
     """
     if not form.fullmatch(str(key)):
-        raise UserError(f"{file}: {str(key)[:80]!r} is no name of a job: run the study again")
+        raise UserError(f"{file}: {str(key)[:80]!r} is not the name of a job: run the study again")
     return key
 
 

@@ -6,10 +6,10 @@ import importlib
 import os
 import platform
 import subprocess
+import sys
 import time
 import traceback
 from collections.abc import Mapping
-from contextlib import redirect_stderr, redirect_stdout
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -44,7 +44,7 @@ def do(job: Job) -> dict[str, Any]:
         with _locked(Path(job["root"]) / LOCKS / job["key"]):
             reads = {role: finished(root / key) for role, key in job["reads"].items()}
             if missing := [job["reads"][role] for role, done in reads.items() if done is None]:
-                raise UserError(f"{missing[0]}, which it reads, is not there any more: run the study again")
+                raise UserError(f"{missing[0]}, which this job reads, is gone: run the study again")
             module, _, name = job["work"].partition(":")
             work = getattr(importlib.import_module(module), name)
             directory = RunDirectory(root, Console(stderr=True))
@@ -68,16 +68,18 @@ def do_logged(job: Job) -> dict[str, Any]:
     """`do`, with all that it and its child processes print in the job's log, on whatever engine."""
     path = Path(job["root"]) / LOGS / f"{job['key']}.txt"
     path.parent.mkdir(parents=True, exist_ok=True)
-    kept = {stream: os.dup(stream) for stream in (1, 2)}
-    with path.open("a", buffering=1, encoding="utf-8") as file, redirect_stdout(file), redirect_stderr(file):
-        try:
-            for stream in kept:  # of child processes, and of libraries that do not ask Python
-                os.dup2(file.fileno(), stream)
-            return do(job)
-        finally:
-            for stream, copy in kept.items():
-                os.dup2(copy, stream)
-                os.close(copy)
+    file, kept = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644), {one: os.dup(one) for one in (1, 2)}
+    try:
+        for stream in kept:  # not sys.stdout: what libraries log goes where it pointed when they were imported
+            os.dup2(file, stream)
+        return do(job)
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        for stream, copy in kept.items():
+            os.dup2(copy, stream)
+            os.close(copy)
+        os.close(file)
 
 
 @cache

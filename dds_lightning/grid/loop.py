@@ -87,7 +87,7 @@ def _outcome(
     over: dict[str, str | None] = {key: error}
     for other in open_nodes:  # in order: those further down come later
         if other not in over and waiting[other] & over.keys():
-            over[other] = f"not done, because '{nodes[key].title}' failed"
+            over[other] = f"not done because '{nodes[key].title}' failed"
     return over
 
 

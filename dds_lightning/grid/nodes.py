@@ -79,8 +79,8 @@ def plan(study: Study) -> dict[str, tuple[Cell, Node]]:
         if node.key in found:
             first = found[node.key][0]
             raise UserError(
-                f"two cells are the same, '{first.name()}' and '{cell.name()}': what tells them apart changes nothing "
-                "(a value that is the preset's own, or a setting of another method); leave one out"
+                f"two cells are the same, '{first.name()}' and '{cell.name()}': the setting by which they differ "
+                "changes nothing (it has the preset's own value, or belongs to another method); leave one out"
             )
         found[node.key] = cell, node
     return found

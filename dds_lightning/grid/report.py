@@ -23,8 +23,8 @@ from dds_lightning.study.paper import DATA_DIFFER, LAYOUTS
 from dds_lightning.study.tables import markdown
 
 COMMANDS = (
-    "The commands of each cell, in their order, make it again by hand in an empty folder; what several cells share is "
-    "listed for each of them. In the folder of the study itself they would replace its work."
+    "To repeat a cell by hand, run its commands in this order in an empty folder. Work that several cells share is "
+    "listed with each of them. In the study's own folder the commands would replace its work."
 )
 
 
@@ -92,22 +92,20 @@ def _sections(results: Results) -> list[Section]:
     opening = [str(study["question"])] if study["question"] else []
     opening.append(f"Normalised scores of the last checkpoint{over}; {_progress(results)}.")
     if study["scale"] != 1:
-        opening.append(f"All budgets are multiplied by {study['scale']:g}: this is a trial, not a result.")
+        opening.append(f"All budgets were multiplied by {study['scale']:g}: this is a trial, not a result.")
     if study["budget"]:
         stated = duration(60 * study["budget"] * study["scale"])
         opening.append(f"Stated budget: {stated} of one core; spent: {duration(results.seconds)}.")
     if study["paper"] in LAYOUTS:
         opening.append(f"{LAYOUTS[study['paper']]} {DATA_DIFFER}")
     if cells.empty:
-        return [Section("", [*opening, "No cell is done yet."]), *_making(results)]
+        return [Section("", [*opening, "No cell is finished yet."]), *_making(results)]
     sections = [Section("", opening), Section("Scores", [], results.table())]
     if cells["best"].notna().any():
-        told = (
-            "The best checkpoint was chosen by playing in the test environment while it trained: an optimistic score."
-        )
+        told = "The best checkpoint was chosen by playing in the test environment during training: an optimistic score."
         with_best = set(cells.loc[cells["best"].notna(), "method"])
         if without := [name for name in cells["method"].unique() if name not in with_best]:
-            told += f" Of {', '.join(map(results.label, without))} there is none: they do not play while they train."
+            told += f" {', '.join(map(results.label, without))}: none, because these do not play during training."
         watched = replace(results, cells=cells[cells["method"].isin(with_best)])
         sections.append(Section("The best checkpoint, apart", [told], watched.table("best")))
     if study["paper"] == "figure6" and cells["horizon"].notna().any():
@@ -128,12 +126,12 @@ def _statistics(results: Results) -> list[Section]:
     if len(comparison) > 1:
         told = (
             "Interquartile mean (IQM) over seeds and tasks with its 95 % interval from a bootstrap stratified by task, "
-            "and the probability that a run of the setting beats one of the reference. With few seeds an interval is "
-            "no more than the range of what was seen: settings whose intervals overlap are not told apart here."
+            "and the probability that a run with this setting beats one with the reference. With few seeds an interval "
+            "is no more than the range of the scores; settings whose intervals overlap cannot be told apart here."
         )
         compared = list(next(iter(groups.values())))
         if len(compared) < results.cells["task"].nunique():
-            told += f" Compared on {', '.join(compared)} alone: the other tasks are not finished."
+            told += f" Compared on {', '.join(compared)} only: the other tasks are not finished."
         numbers = comparison.round(2)
         sections.append(Section("Is it real?", [told], numbers, figures.plot_intervals(comparison), "intervals"))
         few = f"The first {figures.MOST} of {len(groups)} settings are drawn; all of them are in the table above."
@@ -142,15 +140,14 @@ def _statistics(results: Results) -> list[Section]:
     effects = results.effects()
     if len(effects):
         told = (
-            "Each value over all values of the other settings, so that more runs speak for it: IQM with its 95 % "
-            "interval, the probability that a run beats one of the setting's first value, and the values whose whole "
-            "interval lies below."
+            "Each value, pooled over all values of the other settings: IQM with its 95 % interval, the probability "
+            "that a run beats one with the setting's first value, and the values whose whole interval lies below."
         )
         sections.append(Section("What each setting does", [told], effects.round(2)))
     if budgets:
         told = (
-            f"Score of the setting that one would deploy after at most {PULLS} evaluation episodes in all, spent by an "
-            "upper-confidence bandit on eight of the trained policies at a time."
+            f"Score of the setting that one would deploy after at most {PULLS} evaluation episodes in all, which an "
+            "upper-confidence bandit spends on up to eight of the trained policies."
         )
         sections.append(
             Section("How many evaluations it takes", [told], None, figures.plot_budgets(budgets), "budgets")

@@ -53,7 +53,9 @@ def _cells(place: Path) -> tuple[Mapping[str, Any], dict[str, list[str]]]:
     """What a study's folder says about its cells; key of a cell -> keys of the jobs that it is made of."""
     file = place / CELLS
     if not file.is_file():
-        raise UserError(f"{place} holds no study: there is no {file.name}; give OUT/NAME of `dds study run`")
+        raise UserError(
+            f"{place} holds no study (it has no {file.name}): give the folder OUT/NAME that `dds study run` wrote"
+        )
     with parsing(file, REMEDY):
         read = mapping(read_json(file, 64 * TEXT, root=place), file)
         conform(read, {"study": (dict,), "cells": (list,), "command": (str,)}, str(file))

@@ -84,8 +84,11 @@ def run_study(asked: Asked) -> Report:
     told = [f"{nodes[key].title}: {reason}" for key, reason in failed.items() if not reason.startswith("not done")]
     report.data["failed"] = why
     if failed:
-        report.text += [f"{counted(len(why), 'cell')} of {len(cells)} failed; the same command tries again:", *told]
-        report.text.append(f"what each job printed is in {asked.out / LOGS}, a file for each")
+        report.text += [
+            f"{len(why)} of {counted(len(cells), 'cell')} failed; run the same command to try again:",
+            *told,
+        ]
+        report.text.append(f"the output of each job is in {asked.out / LOGS}")
         report.status = 1
     return report
 
@@ -110,7 +113,7 @@ def do_nodes(asked: Asked, nodes: Mapping[str, Node], known: Found) -> dict[str,
             progress.past[node.kind].append(work.seconds)
     todo = needed(nodes, done)
     progress.total = len(todo)
-    console.print(f"{counted(len(nodes), 'job')}, {len(done)} of them done before, {len(todo)} to do")
+    console.print(f"{counted(len(nodes), 'job')}: {len(todo)} to do, the others done before or not needed")
     if not todo:
         return {}
     engine = _engine(asked)

@@ -139,5 +139,5 @@ def test_what_ray_can_never_give_is_refused_here_and_told_of_a_cluster(fake_ray,
 
 def test_where_there_is_no_slurm_it_is_told_in_a_sentence(tmp_path):
     pytest.importorskip("submitit")
-    with pytest.raises(UserError, match="--engine is slurm, and submitit finds no Slurm here"):
+    with pytest.raises(UserError, match="--engine is slurm, but submitit finds no Slurm here"):
         Slurm(tmp_path, 1)

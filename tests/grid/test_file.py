@@ -88,28 +88,37 @@ def test_packaged_studies_can_be_planned(name):
         ({"tasks": []}, "tasks is missing or empty"),
         (
             {"task_settings": {"pointmaze-umaze": {"skill.model.lr": 1e-3}}},
-            "pointmaze-umaze is no task of this study: did",
+            "pointmaze-umaze is not a task of this study: did",
         ),
         ({"task_settings": {TASK: 3}}, f"task_settings: {TASK} is 3, expected settings"),
-        ({"task_settings": {TASK: {"skil.model.lr": 1}}}, "skil.model.lr is no setting: did you mean skill.model.lr"),
-        ({"grid": {"skill.model.num_skills": []}}, r"skill.model.num_skills is \[\], expected a list of one or more"),
-        ({"grid": {"skill.model.num_skills": [4, 8, 4]}}, "skill.model.num_skills holds 4 twice"),
-        ({"seeds": [0, 0]}, "seeds holds 0 twice"),
+        (
+            {"task_settings": {TASK: {"skil.model.lr": 1}}},
+            "skil.model.lr is not a setting: did you mean skill",
+        ),
+        (
+            {"grid": {"skill.model.num_skills": []}},
+            r"skill.model.num_skills is \[\], expected a list with at",
+        ),
+        ({"grid": {"skill.model.num_skills": [4, 8, 4]}}, "skill.model.num_skills lists 4 twice"),
+        ({"seeds": [0, 0]}, "seeds lists 0 twice"),
         ({"seeds": [-1]}, "seeds is -1, expected a whole number from 0"),
-        ({"seeds": [0.5]}, "seeds holds 0.5, expected whole numbers"),
+        ({"seeds": [0.5]}, "seeds lists 0.5, expected whole numbers"),
         (
             {"grid": {"skill.model.num_skils": [4]}},
             r"--skill.model.num_skils is not an option of `dds skill fit`: did you mean --skill.model.num_skills or",
         ),
         ({"settings": {"skill.model.num_skills": "many"}}, "num_skills is many, expected a whole number"),
-        ({"settings": {"skil.model.num_skills": 4}}, r"is no setting: did you mean skill.model.num_skills"),
-        ({"settings": {"clone.model.lr": 0.1}}, "clone.model.lr is a setting of clone, which no method of this study"),
+        ({"settings": {"skil.model.num_skills": 4}}, r"is not a setting: did you mean skill.model.num_skills"),
+        ({"settings": {"clone.model.lr": 0.1}}, "clone.model.lr is a setting of clone, but the methods of this"),
         ({"settings": {"policy.data.skill": "x.ckpt"}}, "policy.data.skill is set by the study itself"),
-        ({"settings": {"evaluate.noise": 0.5}}, r"evaluate.noise is no setting .*did you mean evaluate.noise_scale or"),
+        (
+            {"settings": {"evaluate.noise": 0.5}},
+            r"evaluate.noise is not a setting .*mean evaluate.noise_scale or",
+        ),
         ({"settings": {"evaluate.selection": "best"}}, "evaluate.selection is 'best', expected greedy, sample"),
         ({"variants": {"same": {"skill.model.skill_dim": 64}}}, "two cells are the same, .* and '.*same"),
-        ({"variants": {"base": {"skill.model.skill_dim": 32}}}, "base is there without being named"),
-        ({"gird": {}}, r"gird is no setting of a study: did you mean grid\?"),
+        ({"variants": {"base": {"skill.model.skill_dim": 32}}}, "base is added without being named"),
+        ({"gird": {}}, r"gird is not a setting of a study: did you mean grid\?"),
         ({"seeds": 3}, "seeds is 3, expected a list"),
         (
             {"columns": ["skill.model.num_skills"]},
@@ -124,15 +133,15 @@ def test_packaged_studies_can_be_planned(name):
         ({"methods": ["clone"], "settings": {"evaluate.hold": 5}}, "evaluate.hold is for agents over skills, .* BC "),
         ({"settings": {"data.steps": 0.5}}, r"data.steps is 0\.5, expected a whole number of at least 1"),
         ({"settings": {"data.seed": -1}}, "data.seed is -1, expected 0 to"),
-        ({"settings": {"data.step": 5}}, "data.step is no setting .*did you mean data.steps"),
+        ({"settings": {"data.step": 5}}, "data.step is not a setting .*did you mean data.steps"),
         ({"data": "local:x", "settings": {"data.steps": 5}}, "data.steps is for data that are collected, and data is"),
         ({"budget": -1}, "budget is -1, expected core-minutes, more than 0"),
-        ({"paper": "table4"}, "paper is table4, .*did you mean table"),
+        ({"paper": "table4"}, "paper is table4, expected .*did you mean table"),
         ({"reference": "iql"}, "reference names iql, which the study does not have, expected some of dds"),
         ({"labels": {"K": "skills"}}, "labels names K, which the study does not have"),
         ({"rows": ["task"], "columns": ["task"]}, "rows and columns name task twice"),
-        ({"tasks": [["a"]]}, r"tasks holds \['a'\], expected names"),
-        ({"methods": [["dds"]]}, r"methods holds \['dds'\], expected names"),
+        ({"tasks": [["a"]]}, r"tasks lists \['a'\], expected names"),
+        ({"methods": [["dds"]]}, r"methods lists \['dds'\], expected names"),
         (
             {"grid": {"policy.model.alpha": [1, 2]}, "labels": {1: "x", 2: "x"}},
             "of policy.model.alpha, 1 and 2 are both called x",
@@ -154,7 +163,7 @@ def test_a_wrong_study_is_answered_in_one_sentence(tmp_path, keys, message):
 def test_a_key_that_stands_twice_is_refused_with_its_line(tmp_path):
     path = tmp_path / "study.yaml"
     path.write_text(yaml.safe_dump(TINY) + "grid:\n  skill.model.lr: [0.1]\n  skill.model.lr: [0.2]\n")
-    with pytest.raises(UserError, match=r"skill\.model\.lr stands twice, the second time in line 6"):
+    with pytest.raises(UserError, match=r"skill\.model\.lr is given twice, the second time in line 6"):
         read_study(path)
 
 

@@ -90,7 +90,7 @@ def test_a_curve_of_online_training_survives_the_file(tmp_path):
     [
         (lambda v: v | {"format": 99}, "install a newer one"),
         (lambda v: v | {"cells": []}, "cells is"),
-        (lambda v: v | {"nodes": {"../../x": {}}}, "is no name of a job"),
+        (lambda v: v | {"nodes": {"../../x": {}}}, "is not the name of a job"),
         (lambda v: v | {"nodes": {KEY: {"seconds": "long"}}}, "seconds is 'long'"),
         (lambda v: v | {"nodes": {KEY: {"seconds": 1, "command": ["dds"]}}}, "command is"),
         (lambda v: v | {"cells": {KEY: {"scores": {}, "episodes": []}}}, "last is"),
@@ -108,7 +108,7 @@ def test_a_curve_of_online_training_survives_the_file(tmp_path):
         (lambda v: v | {"cells": {KEY: {"scores": {"last": 1.0}, "episodes": [[1]]}}}, "expected a list of finite"),
         (lambda v: v | {"cells": {KEY: {"scores": {"last": 1.0, "best": "high"}, "episodes": [1]}}}, "best is 'high'"),
         (lambda v: v | {"cells": {KEY: {"scores": [1], "episodes": [1]}}}, "scores is"),
-        (lambda v: v | {"cells": {"policy-0123456789abcdef": {}}}, "is no name of a job"),
+        (lambda v: v | {"cells": {"policy-0123456789abcdef": {}}}, "is not the name of a job"),
         (lambda v: v | {"made": [{}]}, "versions is"),
         (lambda v: v | {"made": [{"versions": {"torch": 2}, "machine": "x"}]}, "torch is '2'"),
         (

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from dds_lightning.grid.engines import Local
-from dds_lightning.grid.job import NODES, do, do_logged
+from dds_lightning.grid.job import NODES, do
 from dds_lightning.grid.loop import Progress, run_nodes
 from dds_lightning.grid.nodes import in_order, needed
 from dds_lightning.saving.run_directory import finished
@@ -74,20 +74,23 @@ def test_a_failure_is_told_with_its_reason_and_keeps_back_only_what_reads_it(tmp
     reasons = {nodes[key].title: why for key, why in failed.items()}
     assert reasons == {
         "toy 1": "ValueError: cell 1 cannot work",
-        "toy 3": "not done, because 'toy 1' failed",
+        "toy 3": "not done because 'toy 1' failed",
     }
     assert sorted(counted(tmp_path / "count")) == [0, 2, 4]
     assert any("toy 1: failed: ValueError: cell 1 cannot work" in line for line in lines)
 
 
-def test_what_a_job_prints_is_in_its_log_and_nowhere_else(tmp_path, capfd):
-    node = toy_node(1, tmp_path / "count", fails=True)
-    answer = do_logged(node.job(str(tmp_path)))
-    print("after")
-    assert answer["error"] == "ValueError: cell 1 cannot work"
-    assert "cell 1 cannot work" in (tmp_path / "logs" / f"{node.key}.txt").read_text()
-    told = capfd.readouterr()
-    assert (told.out, told.err) == ("after\n", "")
+def test_what_a_job_prints_is_in_its_own_log(tmp_path):
+    nodes = {node.key: node for node in (toy_node(index, tmp_path / "count", fails=True) for index in (1, 2))}
+    engine = Local(1)
+    try:
+        run(nodes, tmp_path, engine)
+    finally:
+        engine.close()
+    for key, node in nodes.items():
+        text = (tmp_path / "logs" / f"{key}.txt").read_text()
+        assert f"ValueError: cell {node.settings['index']} cannot work" in text
+        assert text.count("ValueError: cell") == 1
 
 
 def test_what_only_finished_work_reads_is_not_needed_again(tmp_path):

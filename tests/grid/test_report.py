@@ -118,7 +118,7 @@ def test_settings_are_compared_on_the_tasks_that_are_finished(tmp_path):
     assert [list(scores) for scores in results.groups().values()] == [[TASK]] * 4
     report_study(place)
     text = (place / "report" / "report.md").read_text()
-    assert f"Compared on {TASK} alone: the other tasks are not finished." in text
+    assert f"Compared on {TASK} only: the other tasks are not finished." in text
     whole = made(tmp_path / "whole", tasks=tasks)
     assert [list(scores) for scores in Results.read(whole).groups().values()] == [tasks] * 4
     report_study(whole)
@@ -177,7 +177,7 @@ def test_a_study_that_is_not_finished_has_a_report_of_what_there_is(tmp_path):
     assert results.table().to_numpy().tolist() == [["32", "10.0"]]
     empty = made(tmp_path / "empty", left_out=range(12))
     report_study(empty)
-    assert "No cell is done yet." in (empty / "report" / "report.md").read_text()
+    assert "No cell is finished yet." in (empty / "report" / "report.md").read_text()
 
 
 def test_values_that_are_lists_or_null_have_rows_of_their_own(tmp_path):
@@ -230,7 +230,7 @@ def test_it_is_told_of_which_methods_there_is_no_best_checkpoint(tmp_path):
     (place.parent / NODES / ours / MARKER).unlink()
     report_study(place)
     section = (place / "report" / "report.md").read_text().split("## The best checkpoint, apart")[1].split("##")[0]
-    assert "Of BC there is none: they do not play while they train." in section
+    assert "BC: none, because these do not play during training." in section
     assert "| DDS | 2.0 |" in section
     assert "| BC |" not in section
 
