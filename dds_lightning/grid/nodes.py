@@ -184,7 +184,8 @@ class _Planner:
     def _train(self, cell: Cell, stage: str, made: Mapping[str, Node]) -> Node:
         study, row = self.study, STAGES[stage]
         preset, config = self._preset(cell, stage)
-        given = {**PLAYERS[cell.method].settings.get(stage, {}), **_of(cell.settings, stage)}
+        asked = {**PLAYERS[cell.method].settings.get(stage, {}), **_of(cell.settings, stage)}
+        given = {key: float(value) if _whole(value, preset.get(key)) else value for key, value in asked.items()}
         settings = {**preset, **given}
         for name in BUDGETS:
             if isinstance(settings.get(name), int | float) and settings[name] > 0 and study.scale != 1:
@@ -260,6 +261,11 @@ def needed(nodes: Mapping[str, Node], done: set[str]) -> dict[str, Node]:
         if key in wanted and key not in done:
             wanted |= {inner.key for inner in nodes[key].reads.values()}
     return {key: node for key, node in nodes.items() if key in wanted - done}
+
+
+def _whole(value: Any, usual: Any) -> bool:
+    """Whether it is written without its decimals, 3 for 3.0: the same training."""
+    return isinstance(value, int) and not isinstance(value, bool) and isinstance(usual, float)
 
 
 def _of(settings: Mapping[str, Any], room: str) -> dict[str, Any]:

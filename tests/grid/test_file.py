@@ -117,6 +117,10 @@ def test_packaged_studies_can_be_planned(name):
         ),
         ({"settings": {"evaluate.selection": "best"}}, "evaluate.selection is 'best', expected greedy, sample"),
         ({"variants": {"same": {"skill.model.skill_dim": 64}}}, "two cells are the same, .* and '.*same"),
+        (
+            {"variants": {"one": {"policy.model.alpha": 7}, "other": {"policy.model.alpha": 7.0}}},
+            "two cells are the same, '.*one.*' and '.*other",
+        ),
         ({"variants": {"base": {"skill.model.skill_dim": 32}}}, "base is added without being named"),
         ({"gird": {}}, r"gird is not a setting of a study: did you mean grid\?"),
         ({"seeds": 3}, "seeds is 3, expected a list"),
