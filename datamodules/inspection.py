@@ -79,12 +79,21 @@ def describe(
         if task.maze_map is not None:
             facts["episodes that reach the goal"] = int(terminated.sum())
             facts["free cells visited"] = f"{_visited(trajectories, task)} of {len(task.free_cells())}"
+    dimensions = dimension_table(trajectories, task)
+    still = [j for j in range(trajectories.observation_dim) if dimensions["lowest"][j] == dimensions["highest"][j]]
+    if still:
+        facts["constant observation columns"] = ", ".join(map(str, still))
+    rewards = trajectories.rewards
+    if rewards.min() == rewards.max():
+        facts["every reward"] = round(float(rewards[0]), 6)
+    if trajectories.steps_left_out:
+        facts["steps left out"] = trajectories.steps_left_out
     if repeats := count_repeats(trajectories):
         facts["repeated episodes"] = repeats
     if horizon is not None:
         facts[f"segments of {horizon} steps"] = len(trajectories.windows(horizon))
     facts["fingerprint"] = trajectories.fingerprint()
-    return facts, dimension_table(trajectories, task)
+    return facts, dimensions
 
 
 def count_repeats(trajectories: Trajectories) -> int:

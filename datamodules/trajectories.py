@@ -72,6 +72,8 @@ class Trajectories:
         action_high: (A,) float32.
         task: The task, in its variant, that the data were loaded for; None if unknown. It is neither stored nor part
             of the fingerprint.
+        steps_left_out: Steps that the source holds beside these, because it does not say where they led or because they
+            are beyond a maze's goal; not stored either.
     """
 
     name: str
@@ -84,6 +86,7 @@ class Trajectories:
     action_low: NDArray[np.float32]
     action_high: NDArray[np.float32]
     task: Task | None = field(default=None, kw_only=True)
+    steps_left_out: int = field(default=0, kw_only=True)
 
     # ------------------------------------------------------------------ creating one
 

@@ -92,8 +92,15 @@ def _check_shapes(where: str, arrays: dict[str, NDArray[Any]], observations: int
     for name, width in (("observations", observations), ("actions", actions)):
         shape = arrays[name].shape
         if len(shape) != 2 or shape[1] != (shape[1] if width is None else width):
-            expected = "(steps, any)" if width is None else f"(steps, {width})"
-            raise DataError(f"{where}, {name}: got shape {shape}, expected {expected}; stack one row per step")
+            expected = "(steps, width)" if width is None else f"(steps, {width})"
+            remedy = "stack one row per step"
+            if len(shape) == 1 and name == "actions" and arrays[name].dtype.kind in "iu":
+                remedy = (
+                    "whole numbers look like discrete actions, which are not supported: skills make continuous ones"
+                )
+            elif len(shape) == 1 and width in (None, 1):
+                remedy += f", also where it is a single number: {name}.reshape(-1, 1)"
+            raise DataError(f"{where}, {name}: got shape {shape}, expected {expected}; {remedy}")
     for name in ("rewards", "terminations", "truncations"):
         if arrays[name].ndim != 1:
             raise DataError(

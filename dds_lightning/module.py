@@ -68,7 +68,7 @@ class StageModule(EmbeddingMixin, pl.LightningModule):
         scales = h.get("lr_scale") or {}
         common = [
             ("lr", h.lr > 0, "positive"),
-            ("trainable", parts, f"all or some of {allowed}"),
+            ("trainable", parts, f"all or some of {allowed}; several as [A,B]"),
             ("lr_scale", set(scales) <= set(self.PARTS), f"factors for some of {allowed}"),
             ("lr_scale", all(x > 0 for x in scales.values()), "positive factors: freeze parts with trainable"),
         ]

@@ -593,3 +593,5 @@ checks.round(2)
 # dds evaluate checkpoints/antmaze-umaze-diverse --episodes 100 --selection '[greedy]' --noise_scale 0
 # dds evaluate checkpoints/hopper-medium-expert --out runs/hopper.parquet
 # ```
+#
+# Next: [06 · Look at the skills](06_look_at_skills.ipynb).

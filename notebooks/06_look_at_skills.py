@@ -403,3 +403,5 @@ checks.round(2)
 # ```
 #
 # `make figures` draws those of all shipped checkpoints.
+#
+# Next: [07 · Fine-tune from a checkpoint](07_fine_tune.ipynb).

@@ -676,3 +676,5 @@ checks.round(2)
 # dds checkpoints verify shared/cart
 # dds export shared/cart --out cart.onnx
 # ```
+#
+# Next: [09 · Reproduce a row of the paper](09_reproduce_a_row.ipynb).

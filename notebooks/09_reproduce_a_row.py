@@ -402,3 +402,5 @@ checks.round(1)
 # dds run hopper-medium-expert --data d4rl:hopper-medium-expert --preset paper --skill.trainer.accelerator=gpu \
 #     --policy.trainer.accelerator=gpu --skill.data.device_resident=true --policy.data.device_resident=true
 # ```
+#
+# Next: [10 · Explore with skills](10_explore_with_skills.ipynb).

@@ -254,3 +254,5 @@ checks.round(2)
 #    what the critics believe about skills that the recordings never tried.
 #
 # </details>
+#
+# Next: [11 · Compare settings](11_compare_settings.ipynb).

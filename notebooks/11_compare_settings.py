@@ -114,8 +114,9 @@ figures.plot_profiles(results.groups())
 #
 # ## Would more seeds help?
 #
-# An interval shrinks with the number of seeds, roughly with its square root. Drawing seeds from those that we have
-# shows how wide it would be with more of them, if they scattered as these do.
+# An interval shrinks with the number of seeds, roughly with its square root. Take the results of our seeds again and
+# again, at random and some of them twice (a bootstrap): that shows how wide the interval would be with more seeds, if
+# they scattered as these do.
 
 # %%
 first = next(iter(results.groups().values()))

@@ -164,6 +164,7 @@ def _episodes(rows: _Rows, name: str, where: str, low: ArrayLike, high: ArrayLik
         terminations=terminations,
         truncations=truncations,
         lengths=lengths,
+        steps_left_out=len(last) - len(steps),
         action_low=np.full(rows.actions.shape[1], low, np.float32),
         action_high=np.full(rows.actions.shape[1], high, np.float32),
     )
@@ -335,8 +336,7 @@ class _D4RLRows:
         return self._rows("observations", episode, start, stop)
 
     def taken(self, episode: int, start: int, stop: int) -> tuple[NDArray[Any], NDArray[Any]]:
-        rewards = self._rows("rewards", episode, start, stop)
-        return self._rows("actions", episode, start, stop), rewards.reshape(-1)
+        return self._rows("actions", episode, start, stop), self._rows("rewards", episode, start, stop).reshape(-1)
 
     def _rows(self, key: str, episode: int, start: int, stop: int) -> NDArray[Any]:
         first = int(self.first[episode])

@@ -181,16 +181,18 @@ def overfit(history: list[tuple[int, float]], trained: list[tuple[int, float]], 
     Args:
         history: (step, held-out loss) of every validation, ascending.
         trained: (step, training loss) of the same.
-        over: Validations that a level is the mean of, for single ones are chance.
+        over: Validations that a level of held-out loss is the mean of, for single ones are chance. Those of training
+            loss are single batches': its level is the median of a third of the points since the lowest.
 
     Returns:
         The share and the step; (0, 0) where training loss did not fall, or nothing is known.
     """
     if len(history) < 2 * over or [step for step, _ in history] != [step for step, _ in trained]:
         return 0.0, 0
-    window = np.ones(over) / over
-    held_out, learnt = (np.convolve([loss for _, loss in points], window, "valid") for points in (history, trained))
-    lowest = int(np.argmin(held_out))
-    if not (held_out[lowest] > 0 and learnt[-1] < learnt[lowest]):
+    held_out = np.convolve([loss for _, loss in history], np.ones(over) / over, "valid")
+    lowest = int(np.argmin(held_out)) + over // 2
+    some = max(over, (len(trained) - lowest) // 3)
+    then, now = (float(np.median([loss for _, loss in trained[first:][:some]])) for first in (lowest - 1, -some))
+    if held_out.min() <= 0 or now >= then:
         return 0.0, 0
-    return float(held_out[-1] / held_out[lowest] - 1.0), history[lowest + over // 2][0]
+    return float(held_out[-1] / held_out.min() - 1.0), history[lowest][0]

@@ -265,7 +265,7 @@ def data_check(data: str, task: str | None = None, horizon: int | None = None, r
         facts = check_dataset(spec, task, horizon=horizon)
         return Report(
             {"data": spec, "task": task, "sound": True, "facts": facts, "replay": None},
-            [_facts(facts), *_repeats(facts), f"{spec} is sound" + (f" and fits {task}" if task else "")],
+            [_facts(facts), *_notes(facts), f"{spec} is sound" + (f" and fits {task}" if task else "")],
         )
     if task is None:
         raise UserError("--replay needs an environment: give --task NAME; `dds tasks` lists them")
@@ -278,7 +278,7 @@ def data_check(data: str, task: str | None = None, horizon: int | None = None, r
         {"data": spec, "task": found.task.name, "sound": True, "facts": facts, "replay": found.facts()},
         [
             _facts(facts),
-            *_repeats(facts),
+            *_notes(facts),
             table(found.table().head(12), f"{found.steps} steps in {found.task.name}"),
             *found.lines(),
         ],
@@ -314,13 +314,17 @@ def tasks(name: str | None = None) -> Report:
     )
 
 
-def _repeats(facts: dict[str, object]) -> list[str]:
-    """A line about identical episodes, if there are any."""
-    count = facts.get("repeated episodes")
-    told = (
-        f"{count} of the {facts['episodes']} episodes repeat an earlier one to the bit: training and validation would "
-    )
-    return [told + "share them, and held-out losses mean little; leave the repeats out"] if count else []
+def _notes(facts: dict[str, object]) -> list[str]:
+    """A line about everything that is allowed and seldom meant."""
+    notes = {
+        "steps left out": "{} steps of the file are left out: the last of an episode that was cut off, where the file "
+        "does not say where it led (an array next_observations would), or what lies beyond a maze's goal",
+        "constant observation columns": "observation columns that never change: {}; fine for a goal, useless otherwise",
+        "every reward": "every step pays {}: a critic learns nothing from that; put rewards into the data",
+        "repeated episodes": "{} of the {episodes} episodes repeat an earlier one to the bit: training and validation "
+        "would share them, and held-out losses mean little; leave the repeats out",
+    }
+    return [told.format(facts[name], **facts) for name, told in notes.items() if name in facts]
 
 
 def _facts(facts: dict[str, object]) -> str:

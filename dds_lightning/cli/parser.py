@@ -145,12 +145,32 @@ def prepare(arguments: list[str]) -> list[str]:
                     raise UserError(f"{argument} has no value: write {argument}=VALUE")
                 option = f"{option}={value}"
             out.append(f"--{stage}+=--{option}")
+        elif arguments[0] == "run" and argument.startswith("--"):
+            _refuse_of_a_stage(argument.partition("=")[0])
+            out.append(f"{argument}=true" if argument in flags else argument)
         elif before in flags and argument in ("true", "false"):
             out[-1] = f"{before}={argument}"
         else:
             out.append(f"{argument}=true" if argument in flags else argument)
         before = argument
     return out
+
+
+def _refuse_of_a_stage(option: str) -> None:
+    """Refuse for `dds run` an option of `dds STAGE fit` that does not say of which stage.
+
+    Raises:
+        UserError: Says what to write.
+    """
+    from dds_lightning.training.options import groups
+
+    group, _, inner = option.removeprefix("--").partition(".")
+    if option in ("--data.data", "--data.task", "--config"):
+        known = {"data": "--data DATA", "task": "the task as the first word, dds run TASK", "": "--preset NAME"}
+        raise UserError(f"{option} is an option of one training, such as `dds skill fit`: here give {known[inner]}")
+    if inner and group in {one.name for stage in run_stages() for one in groups(STAGES[stage])}:
+        ways = " or ".join(f"--{stage}.{group}.{inner}" for stage in run_stages())
+        raise UserError(f"{option} does not say which training it is for: write {ways}")
 
 
 def options_of(path: Sequence[str]) -> list[str]:

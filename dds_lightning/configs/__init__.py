@@ -1,5 +1,6 @@
 """The packaged configurations and how a command line finds them."""
 
+import difflib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,10 @@ def find(name: str) -> Path:
     for path in (Path(name), ROOT / name, ROOT / f"{name}.yaml"):
         if path.is_file():
             return path
-    raise UserError(f"--config: there is no file {name}, and the packaged ones are {', '.join(packaged())}")
+    inside = [known for known in packaged() if known.startswith(f"{name}/")]
+    near = inside or difflib.get_close_matches(name, packaged(), n=2, cutoff=0.66)
+    known = f": did you mean {' or '.join(near)}?" if near else f", and the packaged ones are {', '.join(packaged())}"
+    raise UserError(f"--config: there is no file {name}{known}")
 
 
 def known_as(word: str) -> str:

@@ -33,7 +33,7 @@ def agent_card(
         data: Facts about the data, name to value; "source" is where they come from, as `--data` takes it, or a
             sentence that begins with "collected" if they were collected for this agent.
         settings: "skill" and "policy" -> the parsed settings of their training.
-        command: The command that trains the same agent again.
+        command: The command that trained it.
     """
     table = summary_table(episodes)
     table = table[table["kind"] == CONTESTANT]
@@ -66,7 +66,8 @@ action = agent.act(observation)  # a skill every {settings["skill"]["data"]["hor
 
 {trained}
 
-`{command}` makes it again. `sha256sum -c SHA256SUMS` checks the files.
+`{command}` made it. Presets change between versions: what this agent was trained with is what stands above.
+`sha256sum -c SHA256SUMS` checks the files.
 
 ## What it cannot do
 

@@ -64,8 +64,9 @@ def known_task(name: str) -> Task:
     if base in _OWN and not at:
         return _moved(_OWN[base], cells)
     if base not in _TABLE:
-        near = difflib.get_close_matches(base, _TABLE, n=3, cutoff=0.5) or list(_TABLE)
-        raise UserError(f"task: there is no task '{base}'; did you mean {', '.join(near)}? See `dds tasks`")
+        near = difflib.get_close_matches(base, _TABLE, n=3, cutoff=0.5)
+        hint = f"; did you mean {', '.join(near)}? See `dds tasks`" if near else ": `dds tasks` lists them"
+        raise UserError(f"task: there is no task '{base}'{hint}")
     return _moved(_TABLE[base].variant(physics) if at else _TABLE[base], cells)
 
 

@@ -240,7 +240,9 @@ def _read_environment(values: Mapping[str, Any], where: str) -> dict[str, Any]:
     try:
         width, taken = _observation_width(env.observation_space, values, where), env.action_space
         if not isinstance(taken, gym.spaces.Box) or len(taken.shape) != 1:
-            raise UserError(f"task: {where}: the actions of {values['env_id']} are {taken}, {_FLAT}")
+            told = "expected a Box: skills make continuous actions, discrete ones are not supported"
+            told = told if "Discrete" in type(taken).__name__ else _FLAT
+            raise UserError(f"task: {where}: the actions of {values['env_id']} are {taken}, {told}")
         box = {"action_low": taken.low, "action_high": taken.high}
         if not all(name in values or np.isfinite(bound).all() for name, bound in box.items()):
             raise UserError(

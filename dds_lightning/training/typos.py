@@ -96,6 +96,10 @@ def refuse_typos(name: str, arguments: Sequence[str], prefix: str = "") -> None:
         if found is None and option.partition(".")[0] not in unread:
             near = did_you_mean(f"--{prefix}{option}", [f"--{prefix}{one}" for one in known])
             raise UserError(f"--{prefix}{option} is not an option of `dds {name} {subcommand}`{near} {where}")
+        if option == "data" and value and value != MISSING and not Path(value).is_file():
+            raise UserError(
+                f"--{prefix}data is a group of settings: for data write --{prefix}data.data={value} {where}"
+            )
         if value == MISSING:
             raise UserError(f"--{prefix}{option} has no value: write --{prefix}{option}=VALUE {where}")
         if value is not None and found == option and found in known:

@@ -110,7 +110,20 @@ LINES = [
     ("checkpoints verfy", "did you mean verify?"),
     ("evaluate nowhere --selction greedy", "did you mean --selection?"),
     ("tasks --jsn", "did you mean --json?"),
+    # options of another command
+    ("R --trainer.max_steps=3", "which training it is for: write --skill.trainer.max_steps or --policy.trainer.max"),
+    ("R --model.lr 1e-3", "--model.lr does not say which training it is for: write --skill.model.lr or"),
+    (
+        "R --data.data=local:x",
+        "--data.data is an option of one training, such as `dds skill fit`: here give --data DATA",
+    ),
+    ("R --config pointmaze/skill.yaml", "here give --preset NAME"),
+    ("skill fit --data local:x", "--data is a group of settings: for data write --data.data=local:x"),
+    ("S --config pointmaze/skil.yaml", "no file pointmaze/skil.yaml: did you mean pointmaze/skill.yaml"),
+    ("S --config pointmaze", "there is no file pointmaze: did you mean pointmaze/policy.yaml or pointmaze/skill.yaml?"),
+    ("tasks zzz", "there is no task 'zzz': `dds tasks` lists them"),
     # values that do not fit
+    ("S --model.trainable encoder,decoder", "expected all or some of encoder, codebook, decoder; several as [A,B]"),
     ("S --model.lr=fast", "model.lr is fast, expected a number"),
     ("S --model.encoder=transfomer", "did you mean transformer?"),
     ("S --model.lr_scale=1", "a mapping such as"),

@@ -123,3 +123,33 @@ def test_identical_episodes_are_counted_and_said(make_episode: Make, tmp_path: P
     data.save(tmp_path / "data")
     assert main(["data", "check", f"arrays:{tmp_path / 'data'}"]) == 0
     assert "2 of the 4 episodes repeat an earlier one to the bit" in " ".join(capsys.readouterr().out.split())
+
+
+def test_what_is_allowed_and_seldom_meant_is_said(make_episode: Make, tmp_path: Path, capsys: Any) -> None:
+    episodes = [make_episode(5, number) for number in range(2)]
+    for episode in episodes:
+        episode |= {"observations": np.insert(episode["observations"], 1, 7.0, axis=1), "rewards": np.zeros(5)}
+    data = Trajectories.from_episodes("made", episodes)
+    facts = describe(data)[0]
+    assert (facts["constant observation columns"], facts["every reward"]) == ("1", 0.0)
+    data.save(tmp_path / "data")
+    assert main(["data", "check", f"arrays:{tmp_path / 'data'}"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "observation columns that never change: 1; fine for a goal" in said
+    assert "every step pays 0.0: a critic learns nothing from that" in said
+    plain = describe(Trajectories.from_episodes("made", [make_episode(5, 0)]))[0]
+    assert not {"every reward", "steps left out"} & set(plain)
+
+
+def test_steps_that_a_file_does_not_say_the_end_of_are_counted(tmp_path: Path) -> None:
+    import h5py
+
+    rows, ends = np.linspace(0.0, 1.0, 20), np.arange(20) % 10 == 9
+    arrays = {"observations": rows[:, None], "actions": rows[:, None] / 2, "rewards": rows, "terminals": rows < 0}
+    with h5py.File(tmp_path / "cut.hdf5", "w") as file:
+        for name, values in {**arrays, "timeouts": ends}.items():
+            file[name] = values
+    assert check_dataset(f"d4rl:{tmp_path / 'cut.hdf5'}")["steps left out"] == 2
+    with h5py.File(tmp_path / "cut.hdf5", "a") as file:
+        file["next_observations"] = np.append(rows[1:], 1.1)[:, None]
+    assert "steps left out" not in check_dataset(f"d4rl:{tmp_path / 'cut.hdf5'}")

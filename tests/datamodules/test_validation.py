@@ -33,6 +33,14 @@ FAULTS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
         _put("observations", (3, 1), np.nan),
         r"observations: got nan at step 3, column 1, expected finite",
     ),
+    "actions of one number": (
+        _replace("actions", lambda values: np.asarray(values)[:, 0] / 9),
+        r"actions: got shape \(6,\), expected \(steps, 1\); stack one row per step, also where it is a single",
+    ),
+    "discrete actions": (
+        _replace("actions", lambda values: np.arange(len(values))),
+        r"actions: got shape \(\d,\), expected \(steps, 1\); whole numbers look like discrete actions, which are not",
+    ),
     "infinite action": (_put("actions", (2, 0), -np.inf), r"actions: got -inf at step 2, column 0"),
     "reward too large for 32 bits": (
         _put("rewards", 4, 1e300),

@@ -50,6 +50,7 @@ def test_the_card_names_task_score_seed_data_settings_and_command():
         "policy: 12,000 steps, batches of 256; tau 0.9",
         "`dds run pointmaze-large-diverse --seed=3`",
         "| random skills | 2 | 0.0 |",
+        "made it. Presets change between versions: what this agent was trained with is what stands above.",
         "a skill every 10 steps",
         "The data come from this project's controllers: scores are not comparable",
     ):
