@@ -54,7 +54,8 @@ class RollingCheckpoint(Checkpoint):
                 self.path.parent.mkdir(parents=True, exist_ok=True)
             except (FileExistsError, NotADirectoryError):
                 folder = self.path.parent
-                raise UserError(f"checkpoint.dirpath is {folder}, but there is a file: give a folder") from None
+                taken = next(part for part in (folder, *folder.parents) if part.is_file())
+                raise UserError(f"checkpoint.dirpath is {folder}, but {taken} is a file: give a folder") from None
 
     def place(self, trainer: pl.Trainer) -> Path:
         """Where the file of this launch goes."""

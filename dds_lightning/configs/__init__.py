@@ -41,7 +41,9 @@ def find(name: str) -> Path:
         if path.is_file():
             return path
     inside = [known for known in packaged() if known.startswith(f"{name}/")]
-    near = inside or difflib.get_close_matches(name, packaged(), n=2, cutoff=0.66)
+    stems = {known.removesuffix(".yaml"): known for known in packaged()}  # an ending that all have brings none nearer
+    alike = difflib.get_close_matches(name.removesuffix(".yaml"), stems, n=2, cutoff=0.66)
+    near = inside or [stems[stem] for stem in alike]
     known = f": did you mean {' or '.join(near)}?" if near else f", and the packaged ones are {', '.join(packaged())}"
     raise UserError(f"--config: there is no file {name}{known}")
 

@@ -85,7 +85,7 @@ LINES = [
     ("R --skill.data.horizon=0", "skill: horizon: got 0, expected at least 1"),
     ("R --clone.model.lr=-1", "clone: model.lr is -1.0, expected a positive number"),
     ("R --online.model.follow=-1", "online: model.follow is -1.0, expected 0 or more"),
-    ("R --online.data.actions=raw --online.model.follow=0.1", "online: model.follow is 0.1, expected 0"),
+    ("R --online.data.actions=raw", "online: data.actions is raw, expected skills"),
     ("R --policy.trainer.logger=WandbLogger", "pip install -e '.[log]'"),
     ("R --policy.trainer.logger=CSVLogger", "CSVLogger needs save_dir"),
     ("R --policy.trainer.precision=16-mixd", "did you mean 16-mixed"),
@@ -189,7 +189,7 @@ def test_a_file_where_checkpoints_should_go_is_one_sentence(dds, data):
     Path("taken").touch()
     answer = dds(*words_of("S --checkpoint.dirpath=taken", data))
     assert answer.status == 2
-    assert "checkpoint.dirpath is taken, but there is a file: give a folder" in told(answer.err)
+    assert "checkpoint.dirpath is taken, but taken is a file: give a folder" in told(answer.err)
 
 
 def test_slurm_variables_that_do_not_fit_are_one_sentence(dds, data, monkeypatch):
@@ -235,7 +235,7 @@ TYPOS = [
 
 @pytest.mark.parametrize("words", [["skill", "fit", "--help"], ["skill", "fit", "--help", "trainer"], *TYPOS])
 def test_help_and_typos_are_answered_at_once(words):
-    """In a new process, two seconds of processor time."""
+    """In a new process, three seconds of processor time; torch alone would take two more."""
     import resource
     import subprocess
 
@@ -245,4 +245,4 @@ def test_help_and_typos_are_answered_at_once(words):
     ran = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=False)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     assert ran.returncode == (0 if "--help" in words else 2), ran.stderr
-    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 2.0
+    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 3.0

@@ -197,6 +197,6 @@ def test_the_last_line_names_the_folder_and_the_loggers_that_write_elsewhere():
 def test_a_folder_that_cannot_be_made_shows_before_the_first_step():
     Path("file").touch()
     watched = StepProgress(log_every_n_seconds=0.0)
-    with contextlib.redirect_stderr(io.StringIO()) as said, pytest.raises(OSError, match="file"):
+    with contextlib.redirect_stderr(io.StringIO()) as said, pytest.raises(UserError, match="but file is a file"):
         fit([RollingCheckpoint("file/here"), watched], enable_progress_bar=True)
     assert "step" not in said.getvalue()
