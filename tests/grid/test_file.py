@@ -45,6 +45,15 @@ def test_a_setting_that_is_given_as_the_preset_has_it_changes_no_key(tmp_path):
     assert list(plan(plain)) != list(plan(study(tmp_path, settings={"skill.model.skill_dim": 32})))
 
 
+def test_a_setting_that_came_later_changes_no_key_until_it_does_something(tmp_path):
+    """What was trained before it existed is not trained again."""
+    clone = next(node for node in nodes(study(tmp_path, methods=["clone"])).values() if node.kind == "clone")
+    assert not [name for name in clone.settings if "fourier" in name]
+    more = study(tmp_path, methods=["clone"], settings={"clone.model.fourier_features": 8})
+    seen = next(node for node in nodes(more).values() if node.kind == "clone")
+    assert seen.settings["model.fourier_features"] == 8
+
+
 def test_a_task_has_settings_of_its_own_and_a_variant_still_departs_from_them(tmp_path):
     found = study(
         tmp_path,
