@@ -140,11 +140,9 @@ class SkillModule(StageModule):
         rules = [
             ("num_skills", num_skills >= 2, "at least 2: with one code the policy has nothing to choose"),
             ("horizon", horizon >= 1, "at least 1"),
-            ("diffusion_steps", diffusion_steps >= 1, "at least 1"),
             ("encoder_heads", hidden_dim % encoder_heads == 0, f"a divisor of hidden_dim={hidden_dim}"),
             ("time_dim", time_dim % 2 == 0, "an even number: half sines, half cosines"),
             ("noise_scale", noise_scale >= 0, "0 or more"),
-            ("dropout", 0 <= dropout < 1, "in [0, 1)"),
             ("freeze_codes_after", freeze_codes_after is None or freeze_codes_after >= 1, "null or at least 1"),
             ("codebook_ema", codebook_ema is None or 0 < codebook_ema < 1, "null or in (0, 1)"),
             ("trainable", not only_codebook or bottleneck == "vq", "all: a gaussian bottleneck has no codebook"),

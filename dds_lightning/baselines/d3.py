@@ -22,6 +22,7 @@ from dds_lightning.errors import lacks_extra
 from dds_lightning.module import StageModule
 from dds_lightning.nn.embedding import FOURIER
 from dds_lightning.nn.normaliser import ActionBox
+from dds_lightning.nn.ranges import Rule
 
 GAMMA = 0.99
 """d3rlpy takes a power of one discount; batches say theirs."""
@@ -78,7 +79,7 @@ class D3Module(StageModule):
     CONFIG: ClassVar[str]
     """Name of its configuration in `d3rlpy.algos`."""
 
-    def _build(self, init_from: str | None, rules: list[tuple[str, bool, str]], **config: Any) -> None:
+    def _build(self, init_from: str | None, rules: list[Rule], **config: Any) -> None:
         """Make the algorithm from its configuration, and our units around it."""
         self._refuse(rules)
         h = self.hparams
