@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
 import lightning.pytorch as pl
@@ -94,30 +94,7 @@ class OnlineDataModule(pl.LightningDataModule):
         if skill is None and actions == "skills":
             raise UserError("data.skill is missing: give a skill checkpoint (.ckpt or directory), or data.actions raw")
         self.task: Task = get_task(task)
-        auto = "auto" in (self.relabelling.reward_scale, self.relabelling.reward_shift)
-        rules = [
-            (
-                "reward_scale",
-                not auto,
-                "a number or null, as data.reward_shift: what is collected later is not known yet",
-            ),
-            ("prior_share", 0 <= prior_share <= 1, "a share in [0, 1]"),
-            (
-                "prior_rewards",
-                prior_rewards == "known" or data is not None,
-                "known: there are no prior data (data.data)",
-            ),
-            ("prior_rewards", prior_rewards == "known" or prior_share < 1, "known, or data.prior_share below 1"),
-            ("batch_size", batch_size >= 1, "at least 1"),
-            ("updates", updates > 0, "positive"),
-            ("random_steps", random_steps >= 1, "at least 1: the first batch needs transitions"),
-            ("num_envs", num_envs >= 1, "at least 1"),
-            ("bound", bound > 0, "positive"),
-            ("noise_scale", noise_scale is None or noise_scale >= 0, "null or 0 or more"),
-        ]
-        for name, fine, expected in rules:
-            if not fine:
-                raise UserError(f"data.{name} is {self.hparams[name]}, expected {expected}")
+        self.refuse_settings(self.hparams)
         self.model = None if skill is None else load_skills(skill, self.task)
         self.skill = self.model if actions == "skills" else None
         self.space = "raw" if self.skill is None else "discrete" if self.skill.discrete else "continuous"
@@ -139,6 +116,36 @@ class OnlineDataModule(pl.LightningDataModule):
         if data is not None:
             asked = self.relabelling.settings()
             self._prior_module = RelabeledDataModule(task, data, skill, cache=cache, validation_fraction=0, **asked)
+
+    @staticmethod
+    def refuse_settings(settings: Mapping[str, Any]) -> None:
+        """Refuse settings outside their range, whatever the task and the skills.
+
+        Args:
+            settings: All of the settings, by name.
+
+        Raises:
+            UserError: Names the first setting that is not allowed.
+        """
+        prior, share, known = settings["data"], settings["prior_share"], settings["prior_rewards"] == "known"
+        auto = "auto" in (settings["reward_scale"], settings["reward_shift"])
+        number = "a number or null, as data.reward_shift: what is collected later is not known yet"
+        noise = settings["noise_scale"]
+        rules = [
+            ("reward_scale", not auto, number),
+            ("prior_share", 0 <= share <= 1, "a share in [0, 1]"),
+            ("prior_rewards", known or prior is not None, "known: there are no prior data (data.data)"),
+            ("prior_rewards", known or share < 1, "known, or data.prior_share below 1"),
+            ("batch_size", settings["batch_size"] >= 1, "at least 1"),
+            ("updates", settings["updates"] > 0, "positive"),
+            ("random_steps", settings["random_steps"] >= 1, "at least 1: the first batch needs transitions"),
+            ("num_envs", settings["num_envs"] >= 1, "at least 1"),
+            ("bound", settings["bound"] > 0, "positive"),
+            ("noise_scale", noise is None or noise >= 0, "null or 0 or more"),
+        ]
+        for name, fine, expected in rules:
+            if not fine:
+                raise UserError(f"data.{name} is {settings[name]}, expected {expected}")
 
     @property
     def batch_size(self) -> int:

@@ -22,7 +22,6 @@ from dds_lightning.errors import lacks_extra
 from dds_lightning.module import StageModule
 from dds_lightning.nn.embedding import FOURIER
 from dds_lightning.nn.normaliser import ActionBox
-from dds_lightning.nn.ranges import Rule
 
 GAMMA = 0.99
 """d3rlpy takes a power of one discount; batches say theirs."""
@@ -79,9 +78,8 @@ class D3Module(StageModule):
     CONFIG: ClassVar[str]
     """Name of its configuration in `d3rlpy.algos`."""
 
-    def _build(self, init_from: str | None, rules: list[Rule], **config: Any) -> None:
-        """Make the algorithm from its configuration, and our units around it."""
-        self._refuse(rules)
+    def _build(self, init_from: str | None, **config: Any) -> None:
+        """Make the algorithm from its configuration, and our units around it; the settings are checked before."""
         h = self.hparams
         width = self._make_embedding(h)
         self.action_box = ActionBox(h.action_dim)
@@ -196,9 +194,10 @@ class TD3BC(D3Module):
         hidden_dims = list(hidden_dims)
         self.save_hyperparameters(ignore=["init_from"])
         rules = [("alpha", alpha >= 0, "0 or more"), ("target_ema", 0 < target_ema <= 1, "in (0, 1]")]
+        self._refuse(rules)
         rates = {"actor_learning_rate": lr, "critic_learning_rate": lr, "tau": target_ema}
         encoders = dict.fromkeys(("actor_encoder_factory", "critic_encoder_factory"), _encoder(hidden_dims))
-        self._build(init_from, rules, alpha=alpha, **rates, **encoders)
+        self._build(init_from, alpha=alpha, **rates, **encoders)
 
 
 class IQL(D3Module):
@@ -246,11 +245,12 @@ class IQL(D3Module):
         self.save_hyperparameters(ignore=["init_from"])
         rules = [("tau", 0 < tau < 1, "in (0, 1)"), ("target_ema", 0 < target_ema <= 1, "in (0, 1]")]
         rules += [("beta", beta >= 0, "0 or more"), ("weight_clip", weight_clip > 0, "positive")]
+        self._refuse(rules)
         rates = {"actor_learning_rate": lr, "critic_learning_rate": lr, "tau": target_ema}
         names = ("actor_encoder_factory", "critic_encoder_factory", "value_encoder_factory")
         encoders = dict.fromkeys(names, _encoder(hidden_dims))
         shape = {"expectile": tau, "weight_temp": beta, "max_weight": weight_clip}
-        self._build(init_from, rules, **shape, **rates, **encoders)
+        self._build(init_from, **shape, **rates, **encoders)
 
 
 class CQL(D3Module):
@@ -296,8 +296,9 @@ class CQL(D3Module):
         self.save_hyperparameters(ignore=["init_from"])
         rules = [("conservatism", conservatism >= 0, "0 or more"), ("samples", samples >= 1, "at least 1")]
         rules += [("actor_lr", actor_lr > 0, "positive"), ("target_ema", 0 < target_ema <= 1, "in (0, 1]")]
+        self._refuse(rules)
         rates = {"actor_learning_rate": actor_lr, "temp_learning_rate": actor_lr, "critic_learning_rate": lr}
         rates |= {"alpha_learning_rate": 0.0, "tau": target_ema}  # the weight of the conservative term stays
         encoders = dict.fromkeys(("actor_encoder_factory", "critic_encoder_factory"), _encoder(hidden_dims))
         shape = {"conservative_weight": conservatism, "n_action_samples": samples}
-        self._build(init_from, rules, **shape, **rates, **encoders)
+        self._build(init_from, **shape, **rates, **encoders)

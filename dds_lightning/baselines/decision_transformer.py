@@ -83,6 +83,7 @@ class DecisionTransformer(D3Module):
             ("max_steps", max_steps >= 1, "at least 1"),
             ("warmup_steps", warmup_steps >= 1, "at least 1"),
         ]
+        self._refuse(rules)
         d3 = library()
         optimiser = d3.optimizers.AdamWFactory(
             weight_decay=weight_decay,
@@ -94,7 +95,6 @@ class DecisionTransformer(D3Module):
         encoder = d3.models.VectorEncoderFactory([hidden_dim], exclude_last_activation=True)
         self._build(
             init_from,
-            rules,
             learning_rate=lr,
             optim_factory=optimiser,
             encoder_factory=encoder,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from dds_lightning.agent import DDSAgent
 from dds_lightning.baselines.methods import METHODS, Method, method_of
 from dds_lightning.console.reports import Report
 from dds_lightning.errors import UserError
@@ -14,7 +15,7 @@ from dds_lightning.saving.checkpoint import load_ckpt, stage_of
 from dds_lightning.saving.published import load_published
 from dds_lightning.study.evaluate import episodes_to_play, report_episodes
 from dds_lightning.study.loose import loose_task
-from dds_lightning.study.protocol import LAST, full_name
+from dds_lightning.study.protocol import LAST, heading, protocol
 from dds_lightning.tasks import Task
 
 
@@ -74,11 +75,15 @@ def evaluate_baseline(
     result = rollout(wanted, [Contestant(method.title, actor, count)], seed=seed, workers=workers)
     summary = result.summary()
     summary.insert(1, "checkpoint", LAST)
-    facts: dict[str, Any] = {"method": method.name, "task": full_name(wanted), "environment": wanted.env_id}
-    facts |= {"episodes": count, "seed": seed, "checkpoint": LAST, "horizon": getattr(actor, "horizon", None)}
-    facts |= dict.fromkeys(("noise_scale", "sampler", "temperature", "best"))
-    facts |= {name: getattr(wanted, name) for name in ("max_episode_steps", "score_min", "score_max", "paper_score")}
-    how = f"{facts['task']} ({wanted.env_id}): {count} episodes, seed {seed}; {method.title}, {method.source}"
+    agent = actor if isinstance(actor, DDSAgent) else None
+    temperature = 1.0 if agent is None else agent.temperature
+    facts = {"method": method.name, **protocol(wanted, agent, episodes=count, seed=seed, temperature=temperature)}
+    how = (
+        f"{facts['task']} ({wanted.env_id}): {count} episodes, seed {seed}"
+        if agent is None
+        else f"{heading(facts)}, {agent.selection}"
+    )
+    how += f"; {method.title}, {method.source}"
     data = {"agent": policy, "best": None, "task": wanted.name, "seed": seed, "protocol": facts}
     return report_episodes(result, summary, wanted, [how], data, out)
 

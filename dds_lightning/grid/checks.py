@@ -172,7 +172,7 @@ def _check_setting(key: str, value: Any, trained: set[str]) -> None:
 def check_stage(stage: str, settings: Mapping[str, Any], task: str, skill: Mapping[str, Any]) -> None:
     """Refuse settings that a stage's own module or data would refuse when its training begins.
 
-    The module is made without memory for its weights. What takes other packages, or more than dimensions, is not made.
+    The module is made without memory for its weights. Where a package is missing, only its settings are looked at.
 
     Args:
         stage: Its name.
@@ -183,36 +183,52 @@ def check_stage(stage: str, settings: Mapping[str, Any], task: str, skill: Mappi
     Raises:
         UserError: Names the first setting.
     """
-    row = STAGES[stage]
     rooms: dict[str, dict[str, Any]] = {"model": {}, "data": {}}
     for key, value in settings.items():
         room, _, name = key.partition(".")
         if room in rooms and value != str(inspect.Parameter.empty):  # the class knows its default
             rooms[room][name] = value
-    model, data, known = rooms["model"], rooms["data"], get_task(task)
+    for room, refuse in {"data": _refuse_data, "model": _refuse_model}.items():
+        try:
+            refuse(stage, rooms, task, skill)
+        except UserError as error:
+            named = str(error).startswith(("model.", "data."))
+            if room == "data" or named:  # else the module lacks a package, or weights to start from
+                raise UserError(f"{stage}.{error}" if named else f"{stage}.data.{error}") from None
+        except Exception:  # noqa: S110 - what no rule of the stage's forbids is left to the training
+            pass
+
+
+def _refuse_data(stage: str, rooms: Mapping[str, Mapping[str, Any]], task: str, skill: Mapping[str, Any]) -> None:
+    """Ask the rules of a stage's data, as far as they need neither data nor checkpoints."""
+    row, data = STAGES[stage], rooms["data"]
+    if row.data == STAGES["skill"].data:
+        row.data_class()(task=task, **data)
+        return
+    if "gamma" in data:
+        Relabelling(**{one.name: data[one.name] for one in fields(Relabelling)})
+    if refuse_settings := getattr(row.data_class(), "refuse_settings", None):
+        refuse_settings({"data": None, **data})
+
+
+def _refuse_model(stage: str, rooms: Mapping[str, Mapping[str, Any]], task: str, skill: Mapping[str, Any]) -> None:
+    """Ask the rules of a stage's module by making it."""
+    import torch
+
+    row, (model, data), known = STAGES[stage], (rooms["model"], rooms["data"]), get_task(task)
+    skills = {name.removeprefix("model."): value for name, value in skill.items() if name.startswith("model.")}
     links = {"observation_dim": known.observation_dim, "action_dim": known.action_dim, "horizon": data.get("horizon")}
-    links |= {"num_skills": skill.get("model.num_skills"), "skill_dim": skill.get("model.skill_dim")}
-    links |= {"skill_hash": None}
-    try:
-        if row.data == STAGES["skill"].data:
-            row.data_class()(task=task, **data)
-        elif "gamma" in data:
-            Relabelling(**{one.name: data[one.name] for one in fields(Relabelling)})
-        if set(row.links) <= links.keys() and model.get("init_from") is None and not _takes_more(stage):
-            import torch
-
-            with torch.device("meta"):
-                row.module_class()(**{name: links[name] for name in row.links}, **model)
-    except UserError as error:
-        told = str(error) if str(error).startswith(("model.", "data.")) else f"data.{error}"
-        raise UserError(f"{stage}.{told}") from None
-    except Exception:  # noqa: S110 - what no rule of the stage's forbids is left to the training
-        pass
-
-
-def _takes_more(stage: str) -> bool:
-    """Whether a stage needs a package that may not be here."""
-    return any(method.extra and stage == method.stages[-1] for method in PLAYERS.values())
+    links |= {"num_skills": skills.get("num_skills"), "skill_dim": skills.get("skill_dim"), "skill_hash": None}
+    if "space" in row.links:
+        raw, discrete = data["actions"] == "raw", skills.get("bottleneck") == "vq"
+        links["space"] = "raw" if raw else "discrete" if discrete else "continuous"
+        links["choices"] = known.action_dim if raw else links["num_skills" if discrete else "skill_dim"]
+        links["prior_unknown"] = data["prior_rewards"] == "unknown"
+        shape = {"observation_dim": known.observation_dim, "action_dim": known.action_dim}
+        links["skill_settings"] = None if raw else {**skills, **shape, "horizon": skill["data.horizon"]}
+    if model.get("init_from") is None:
+        with torch.device("meta"):
+            row.module_class()(**{name: links[name] for name in row.links}, **model)
 
 
 def _is_number(value: Any) -> bool:

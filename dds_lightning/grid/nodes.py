@@ -135,12 +135,17 @@ class _Planner:
         """Refuse settings of acting with which the evaluation would fail.
 
         Raises:
-            UserError: The agent has no skills, or they do not last so long.
+            UserError: The agent has no skills, or no codes, or its skills do not last so long.
         """
         of_skills = sorted(asked.keys() - {"episodes"})
         if of_skills and "skill" not in made:
             title = PLAYERS[cell.method].title
             raise UserError(f"evaluate.{of_skills[0]} is for agents over skills, and {title} has none: leave it out")
+        if asked.get("selection") == "argmax_q" and made["skill"].settings["model.bottleneck"] != "vq":
+            title = PLAYERS[cell.method].title
+            raise UserError(
+                f"evaluate.selection is argmax_q, which needs codes, and the skills of {title} are continuous"
+            )
         horizon = made["skill"].settings["data.horizon"] if "skill" in made else 0
         if asked.get("hold", 0) > horizon:
             raise UserError(f"evaluate.hold is {asked['hold']}, expected at most {horizon}, the steps that skills last")

@@ -62,6 +62,30 @@ def _cells(place: Path) -> tuple[Mapping[str, Any], dict[str, list[str]]]:
         return read, {cell["key"]: [check_key(key, file) for key in cell["nodes"]] for cell in read["cells"]}
 
 
+def refuse_other_study(place: Path, title: str, file: Path) -> None:
+    """Refuse a folder in which another study file of the same name has put its cells: its report would be lost.
+
+    A file that has moved, or says more than before, is the same study as long as its place or its title is.
+
+    Args:
+        place: The study's folder.
+        title: Of the study that is to run.
+        file: The study file.
+
+    Raises:
+        UserError: Names the other study.
+    """
+    if not (place / CELLS).is_file():
+        return
+    other = _cells(place)[0]
+    there, called = other.get("file", ""), other["study"].get("title", title)
+    if called != title and there not in ("", str(file.absolute())):
+        raise UserError(
+            f"{place} holds the study '{called}' of {there}, another file of the same name: give this one another name "
+            "or another --out"
+        )
+
+
 def read_state(place: Path) -> tuple[float, dict[str, str]]:
     """Seconds on the clock that all launches of a study took, and job -> why it failed in the last.
 

@@ -30,7 +30,7 @@ from dds_lightning.grid.found import Found, found_elsewhere
 from dds_lightning.grid.job import LOGS, NODES
 from dds_lightning.grid.loop import Progress, run_nodes
 from dds_lightning.grid.nodes import Node, in_order, needed, plan
-from dds_lightning.grid.results import CELLS, KNOWN, STATE, read_state
+from dds_lightning.grid.results import CELLS, KNOWN, STATE, read_state, refuse_other_study
 from dds_lightning.saving.run_directory import Done, duration, finished, locked, write_json
 
 
@@ -69,7 +69,8 @@ def run_study(asked: Asked) -> Report:
     if asked.plan_only:
         return _planned(asked, study, cells, nodes, known)
     with locked(asked.out):
-        write_json(place / CELLS, _table(study, cells, asked))
+        refuse_other_study(place, study.title, path)
+        write_json(place / CELLS, _table(study, cells, path, asked))
         if known.outcomes:
             known.save(place / KNOWN)
         before, began, failed = read_state(place)[0], time.monotonic(), dict[str, str]()
@@ -141,15 +142,16 @@ def _engine(asked: Asked) -> Engine:
     return Local(asked.workers or available_cores())
 
 
-def _table(study: Study, cells: Mapping[str, tuple[Cell, Node]], asked: Asked) -> dict[str, Any]:
-    """What the report needs to know about the cells, as JSON values."""
+def _table(study: Study, cells: Mapping[str, tuple[Cell, Node]], path: Path, asked: Asked) -> dict[str, Any]:
+    """What the report needs to know about the cells, as JSON values, and the study file that they are from."""
     rows = [
         {"key": key, **asdict(cell), "nodes": list(in_order([node])), "title": cell.name()}
         for key, (cell, node) in cells.items()
     ]
     words = ["dds", "study", "run", asked.file, f"--out={asked.out}"]
     words += [] if study.scale == 1 else [f"--scale={study.scale:g}"]
-    return {"format": 1, "study": asdict(study), "cells": rows, "command": shlex.join(words)}
+    told = {"file": str(path.absolute()), "command": shlex.join(words)}
+    return {"format": 1, "study": asdict(study), "cells": rows, **told}
 
 
 def _finished(asked: Asked, nodes: Mapping[str, Node]) -> dict[str, Done]:

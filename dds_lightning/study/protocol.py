@@ -21,7 +21,7 @@ LAST, BEST = "last", "best"
 
 def protocol(
     task: Task,
-    agent: DDSAgent,
+    agent: DDSAgent | None,
     *,
     episodes: int,
     seed: int,
@@ -33,7 +33,7 @@ def protocol(
 
     Args:
         task: The task, in its variant.
-        agent: The agent that plays.
+        agent: The agent that plays; None for an actor without skills.
         episodes: Episodes of each contestant.
         seed: Seed of environments and agents.
         temperature: Temperature of sampled codes.
@@ -44,19 +44,20 @@ def protocol(
         Plain values: `task` (with its variant), `environment`, `episodes`, `seed`, `checkpoint`, `noise_scale`
         (factor on the decoder's noise), `sampler` (of the decoder; None for one without noise), `temperature`,
         `horizon` (steps for which a skill is held), `max_episode_steps`, `score_min` and `score_max` (returns that
-        score 0 and 100), `paper_score` (None if the paper has none), `best` (None without one).
+        score 0 and 100), `paper_score` (None if the paper has none), `best` (None without one). What only skills have
+        is None without an agent.
     """
-    settings = agent.skill.hparams
+    settings = {} if agent is None else agent.skill.hparams
     return {
         "task": full_name(task),
         "environment": task.env_id,
         "episodes": episodes,
         "seed": seed,
         "checkpoint": checkpoint,
-        "noise_scale": agent.noise_scale,
+        "noise_scale": None if agent is None else agent.noise_scale,
         "sampler": settings["sampler"] if settings.get("decoder") == "diffusion" else None,
-        "temperature": temperature,
-        "horizon": agent.hold,
+        "temperature": None if agent is None else temperature,
+        "horizon": None if agent is None else agent.hold,
         "max_episode_steps": task.max_episode_steps,
         "score_min": task.score_min,
         "score_max": task.score_max,
@@ -71,7 +72,7 @@ def full_name(task: Task) -> str:
 
 
 def heading(facts: Mapping[str, Any]) -> str:
-    """Return a protocol as the line above its table."""
+    """Return the protocol of an agent as the line above its table."""
     decoder = "decoder without noise"
     if facts["sampler"] is not None:
         decoder = f"decoder noise {facts['noise_scale']:g} ({facts['sampler']})"

@@ -50,6 +50,15 @@ def test_one_over_continuous_skills_plays_with_them(dds, data, tmp_path):
     answer = dds(*words, "--skill", skill, "--json").json
     assert [row["actor"] for row in answer["results"]] == ["OPAL"]
     assert answer["protocol"]["horizon"] == 5
+    acting = ["--noise_scale", "0.5", "--hold", "2", "--selection", "sample", "--temperature", "0.7"]
+    protocol = dds(*words, "--skill", skill, *acting, "--json").json["protocol"]
+    assert (protocol["noise_scale"], protocol["horizon"], protocol["temperature"]) == (0.5, 2, 0.7)
+    refused = dds(*words, "--skill", skill, "--hold", 6)
+    assert refused.status == 2
+    assert "hold is 6, expected 1 to 5" in told(refused.err)
+    refused = dds(*words, "--skill", skill, "--selection", "argmax_q")
+    assert refused.status == 2
+    assert "'argmax_q', which needs codes, but the skills are cont" in told(refused.err)
     refused = dds(*words)
     assert refused.status == 2
     assert "OPAL plays with checkpoints of skill, opal: skill is missing" in told(refused.err)

@@ -165,6 +165,22 @@ def test_packaged_studies_can_be_planned(name):
         ({"grid": {"skill.data.stride": [1, 0]}}, "skill.data.stride: got 0, expected at least 1"),
         ({"settings": {"policy.data.gamma": 2.0}}, r"policy.data.gamma is 2\.0, expected a discount in"),
         ({"methods": ["idql"], "settings": {"idql.model.lr": 0.0}}, r"idql.model.lr is 0\.0, expected positive"),
+        ({"methods": ["iql"], "settings": {"iql.model.tau": 1.5}}, r"iql.model.tau is 1\.5, expected in \(0, 1\)"),
+        ({"methods": ["dt"], "settings": {"dt.model.heads": 3}}, "dt.model.heads is 3, expected a divisor of hidden"),
+        ({"methods": ["online"], "settings": {"online.model.critics": 0}}, "online.model.critics is 0, expected at l"),
+        (
+            {"methods": ["online"], "settings": {"online.data.updates": 0}},
+            r"online.data.updates is 0\.0, expected positive",
+        ),
+        ({"methods": ["online"], "settings": {"online.data.stride": 0}}, "online.data.stride is 0, expected at least"),
+        (
+            {"methods": ["online"], "settings": {"online.data.actions": "raw", "online.model.follow": 1e-4}},
+            r"online.model.follow is 0\.0001, expected 0: there are no skills",
+        ),
+        (
+            {"methods": ["opal"], "settings": {"evaluate.selection": "argmax_q"}},
+            "evaluate.selection is argmax_q, which needs codes, and the skills of OPAL are continuous",
+        ),
     ],
 )
 def test_a_wrong_study_is_answered_in_one_sentence(tmp_path, keys, message):

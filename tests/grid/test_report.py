@@ -84,7 +84,7 @@ def made(tmp_path, best=False, left_out=(), **keys):
                 root / one.key / MADE, {"versions": {"torch": "2.13"}, "commit": "abc123", "machine": "x, 2 cores"}
             )
     place = tmp_path / "mine"
-    write_json(place / CELLS, _table(study, cells, Asked(str(path), tmp_path)))
+    write_json(place / CELLS, _table(study, cells, path, Asked(str(path), tmp_path)))
     return place
 
 
