@@ -134,7 +134,7 @@ class RayTasks:
         gpus: Of each task; may be a fraction.
 
     Raises:
-        UserError: Ray is not installed, or no task could ever begin on this machine.
+        UserError: Ray is not installed or does not start, or no task could ever begin on this machine.
     """
 
     def __init__(self, workers: int | None, cpus: int = 1, gpus: float = 0) -> None:
@@ -144,7 +144,12 @@ class RayTasks:
         if not ray.is_initialized():
             count = None if workers is None else workers * cpus
             alone = {"num_cpus": count, "include_dashboard": False} if here else {}
-            ray.init(log_to_driver=False, configure_logging=False, **alone)
+            try:
+                ray.init(log_to_driver=False, configure_logging=False, **alone)
+            except Exception as error:  # Ray's own have no common class
+                tried = "it does not start here" if here else f"RAY_ADDRESS={os.environ['RAY_ADDRESS']} does not answer"
+                told = (str(error).splitlines() or [type(error).__name__])[0]
+                raise UserError(f"--engine is ray, but {tried}: {told}") from None
         self._refuse_too_much(cpus, gpus, here)
         # A worker that is lost is Ray's to replace; an error of ours is an answer, and not tried again.
         self._do = ray.remote(max_retries=TRIES - 1, num_cpus=cpus, num_gpus=gpus)(do_logged)

@@ -137,6 +137,18 @@ def test_what_ray_can_never_give_is_refused_here_and_told_of_a_cluster(fake_ray,
     assert "num_cpus" not in fake_ray[0]
 
 
+def test_a_ray_that_does_not_start_is_told_in_a_sentence(fake_ray, monkeypatch):
+    def fail(**more):
+        raise ConnectionError("Could not find a node\nafter 30 s")
+
+    monkeypatch.setattr(sys.modules["ray"], "init", fail)
+    with pytest.raises(UserError, match="^--engine is ray, but it does not start here: Could not find a node$"):
+        RayTasks(1)
+    monkeypatch.setenv("RAY_ADDRESS", "head:6379")
+    with pytest.raises(UserError, match="RAY_ADDRESS=head:6379 does not answer: Could not find a node$"):
+        RayTasks(1)
+
+
 def test_where_there_is_no_slurm_it_is_told_in_a_sentence(tmp_path):
     pytest.importorskip("submitit")
     with pytest.raises(UserError, match="--engine is slurm, but submitit finds no Slurm here"):
