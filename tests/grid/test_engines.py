@@ -142,10 +142,10 @@ def test_a_ray_that_does_not_start_is_told_in_a_sentence(fake_ray, monkeypatch):
         raise ConnectionError("Could not find a node\nafter 30 s")
 
     monkeypatch.setattr(sys.modules["ray"], "init", fail)
-    with pytest.raises(UserError, match="^--engine is ray, but it does not start here: Could not find a node$"):
+    with pytest.raises(UserError, match=r"^--engine is ray, but it does not start here: Could not find a node$"):
         RayTasks(1)
     monkeypatch.setenv("RAY_ADDRESS", "head:6379")
-    with pytest.raises(UserError, match="RAY_ADDRESS=head:6379 does not answer: Could not find a node$"):
+    with pytest.raises(UserError, match=r"RAY_ADDRESS=head:6379 does not answer: Could not find a node$"):
         RayTasks(1)
 
 
