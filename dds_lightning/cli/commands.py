@@ -137,7 +137,7 @@ def relabel(
         out: File to write; without it the cache beside the checkpoint, where `dds policy fit` looks.
         **relabelling: Fields of `datamodules.relabelling.Relabelling`.
     """
-    from datamodules.relabel import Relabelled
+    from datamodules.semi_mdp import Relabelled
     from datamodules.relabelled import RelabeledDataModule
 
     settings = Relabelling(**relabelling).settings()
