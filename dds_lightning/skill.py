@@ -147,7 +147,7 @@ class SkillModule(StageModule):
             ("noise_scale", noise_scale >= 0, "0 or more"),
             ("freeze_codes_after", freeze_codes_after is None or freeze_codes_after >= 1, "null or at least 1"),
             ("codebook_ema", codebook_ema is None or 0 < codebook_ema < 1, "null or in (0, 1)"),
-            ("trainable", not only_codebook or bottleneck == "vq", "all: a gaussian bottleneck has no codebook"),
+            ("trainable", not only_codebook or bottleneck == "vq", f"all: a {bottleneck} bottleneck has no codebook"),
             ("trainable", not only_codebook or codebook_ema is None, "more, or codebook_ema: null to give it a loss"),
         ]
         self._refuse(rules)
@@ -213,7 +213,8 @@ class SkillModule(StageModule):
         """
         codes = self.encode_segments(observations, actions, lengths).codes
         if codes is None:
-            raise UserError("bottleneck is gaussian: its skills have no codes; train with bottleneck: vq")
+            kind = self.hparams.bottleneck
+            raise UserError(f"bottleneck is {kind}: its skills have no codes; train with bottleneck: vq")
         return codes
 
     def decode(

@@ -59,7 +59,7 @@ class SegmentMetrics(nn.Module):
     def update(self, decoded: Tensor, actions: Tensor, codes: Tensor | None) -> None:
         """Add decoded and true actions, (B H, A) each, and the codes (B,) of their segments."""
         self.squared_error.update((decoded - actions).square().mean(dim=-1))
-        if self.usage is not None:
+        if self.usage is not None and codes is not None:
             self.usage.update(codes)
 
     def compute(self) -> dict[str, Tensor]:
