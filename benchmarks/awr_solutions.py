@@ -18,7 +18,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from datamodules.relabel import Relabelled
+from datamodules.semi_mdp import Relabelled
 from dds_lightning import DDSAgent, PolicyModule, SkillModule, losses
 from dds_lightning.errors import UserError
 from dds_lightning.rollout.actors import Contestant

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from datamodules.loader import refuse_other_rounds
-from datamodules.relabel import Relabelled
 from datamodules.relabelled import RelabeledDataModule
 from datamodules.relabelling import Relabelling
 from datamodules.robots import load_skills
+from datamodules.semi_mdp import Relabelled
 from dds_lightning.errors import UserError
 from dds_lightning.online.collector import Collector
 from dds_lightning.online.replay import Replay

@@ -14,9 +14,10 @@ from torch import Tensor
 
 from datamodules.loader import TensorLoader, data_state, overfits, refuse_other_data
 from datamodules.partial_codes import PartialCodes
-from datamodules.relabel import Relabelled, refuse_other_transitions, relabel, relabel_key
+from datamodules.relabel import refuse_other_transitions, relabel, relabel_key
 from datamodules.relabelling import Relabelling
 from datamodules.robots import load_skills
+from datamodules.semi_mdp import Relabelled
 from datamodules.sources import load_trajectories
 from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError, refuse_seed

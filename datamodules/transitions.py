@@ -6,6 +6,7 @@ All three are `SegmentDataModule`s: the same data, the same split, the same orde
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -213,11 +214,13 @@ class SequenceDataModule(SegmentDataModule):
         options |= {"device_resident": device_resident, "max_validation_segments": max_validation_segments}
         super().__init__(task, data, horizon, self.relabelling.stride, batch_size, **options)
 
-    def _rewards(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Learning rewards and returns to go of every step, (N,) each."""
+    @cached_property
+    def _rewards(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Learning rewards and returns to go of every step, (N,) each; only after `setup`."""
         settled = self.relabelling.for_task(self.task)
         rewards = settled.learning_rewards(self.trajectories, 1)
-        return rewards, returns_to_go(rewards, self.trajectories.lengths, settled.gamma)
+        returns = returns_to_go(rewards, self.trajectories.lengths, settled.gamma)
+        return rewards.astype(np.float32), returns.astype(np.float32)
 
     def statistics(self) -> dict[str, Tensor]:
         """As of a `SegmentDataModule`, and what rewards and returns are.
@@ -228,7 +231,7 @@ class SequenceDataModule(SegmentDataModule):
             any of its steps.
         """
         found = super().statistics()
-        _, returns = self._rewards()
+        _, returns = self._rewards
         first = returns[self.trajectories.step_offsets[self.training_episodes]]
         episodes = self.trajectories.episode_of(np.arange(len(returns)))
         every = returns[np.isin(episodes, self.training_episodes)]
@@ -244,7 +247,7 @@ class SequenceDataModule(SegmentDataModule):
         assert self._windows is not None
         device = self._place()
         observations, actions = self._tensors(device)
-        rewards, returns = (torch.as_tensor(x, dtype=torch.float32, device=device) for x in self._rewards())
+        rewards, returns = (torch.as_tensor(column, device=device) for column in self._rewards)
         lengths, offsets = self.trajectories.lengths, self.trajectories.step_offsets
         number = torch.from_numpy(np.arange(len(rewards)) - np.repeat(offsets[:-1], lengths)).to(device)
         first_rows = torch.from_numpy(self._windows.observation_starts[segments]).to(device)

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from dds_lightning.envs.flatten import numbers
 from dds_lightning.errors import UserError
 from dds_lightning.saving.fingerprint import same, told_apart
+from dds_lightning.saving.golden import golden_answers
 
 if TYPE_CHECKING:
     from dds_lightning.online.parts import RawActions
@@ -71,19 +72,22 @@ class DDSAgent(nn.Module):
         self.skill: SkillModule = skill  # type: ignore[assignment]  # what shows codes asks for the kinds it can show
         self.policy: PolicyModule | None = policy  # type: ignore[assignment]
         self.discrete = bool(getattr(skill, "discrete", True))
-        self.selection, self.temperature, self._noise_scale = selection, float(temperature), noise_scale
-        self.horizon, self.num_skills = int(skill.horizon), int(skill.num_skills) if self.discrete else 0
+        self.selection, self.temperature = selection, float(temperature)
+        self._noise_scale = noise_scale
+        self.horizon = int(skill.horizon)
+        self.num_skills = int(skill.num_skills) if self.discrete else 0
         self.hold = self.horizon if hold is None else int(hold)
         self.observation_dim = int(skill.hparams["observation_dim"])
         self.action_dim = int(skill.hparams["action_dim"])
         self.fixed_codes = None if fixed_codes is None else np.asarray(fixed_codes, dtype=np.int64)
-        self._check()
+        self._refuse_settings()
+        self._refuse_strangers()
         self.eval()
         self._seed = int(seed)
         self._generator: torch.Generator | None = None
         self._begin(0)
 
-    def _check(self) -> None:
+    def _refuse_settings(self) -> None:
         choices, codes, last = get_args(AgentSelection), self.fixed_codes, self.num_skills - 1
         if not self.discrete and self.selection in ("fixed", "argmax_q"):
             raise UserError(f"selection is '{self.selection}', which needs codes, but the skills are continuous")
@@ -101,20 +105,25 @@ class DDSAgent(nn.Module):
             raise UserError(f"selection is '{self.selection}' and fixed_codes is {codes}: give both or none")
         if codes is not None and (codes.ndim != 1 or not len(codes) or codes.min() < 0 or codes.max() > last):
             raise UserError(f"fixed_codes is {codes}, expected a list of codes of 0 to {last}")
-        if self.policy is not None:
-            theirs: Any = {"num_skills": getattr(self.policy, "num_skills", None), **self.policy.hparams}
-            for name in ("num_skills", "observation_dim"):
-                if (mine := getattr(self, name)) != theirs[name]:
-                    told = f"{name} is {mine} in the skill model and {theirs[name]} in the policy"
-                    raise UserError(f"{told}: they do not belong together")
-            learnt_with = getattr(self.policy, "skill_hash", None)
-            if learnt_with and not same(learnt_with, found := self.skill.fingerprint(), self.policy.OF_DECODER):
-                there, here = told_apart(learnt_with, found)
+
+    def _refuse_strangers(self) -> None:
+        """Refuse a policy that was not trained on these skills."""
+        if self.policy is None:
+            return
+        theirs: Any = {"num_skills": getattr(self.policy, "num_skills", None), **self.policy.hparams}
+        for name in ("num_skills", "observation_dim"):
+            if (mine := getattr(self, name)) != theirs[name]:
                 raise UserError(
-                    f"the policy was trained on the codes of skill model {there}, this one is {here}: they do not "
-                    "belong together; give the skills that it was trained with, or train a policy on these with "
-                    "`dds policy fit --data.skill SKILL.ckpt`"
+                    f"{name} is {mine} in the skill model and {theirs[name]} in the policy: they do not belong together"
                 )
+        learnt_with = getattr(self.policy, "skill_hash", None)
+        if learnt_with and not same(learnt_with, found := self.skill.fingerprint(), self.policy.OF_DECODER):
+            there, here = told_apart(learnt_with, found)
+            raise UserError(
+                f"the policy was trained on the codes of skill model {there}, this one is {here}: they do not "
+                "belong together; give the skills that it was trained with, or train a policy on these with "
+                "`dds policy fit --data.skill SKILL.ckpt`"
+            )
 
     # ---------------------------------------------------------------- acting
 
@@ -269,27 +278,9 @@ class DDSAgent(nn.Module):
 
     # ---------------------------------------------------------------- files
 
-    @torch.inference_mode()
     def golden(self) -> dict[str, list[list[float]]]:
-        """Return the networks' answers to fixed questions, stored with published weights to recognise them by.
-
-        Returns:
-            `actions` (8, A) for fixed states, skills and noise, and, with a policy, its `logits` (8, K; 0 where the
-            data have no support) or its `choices` (8, D). Six digits: other processors round differently.
-        """
-        rows, skill, device = 8, self.skill.eval(), self.device
-        wave = torch.arange(rows * self.observation_dim, device=device).reshape(rows, -1).float().sin()
-        observations = skill.normaliser.mean + skill.normaliser.std * wave  # (8, O), as the data are spread
-        codes = torch.arange(rows, device=device) % max(self.num_skills, 1)
-        skills = codes if self.discrete else wave[:, :1].expand(rows, self._codes.shape[1])
-        count = skill.draws * rows * self.action_dim
-        noise = torch.arange(count, device=device).reshape(skill.draws, rows, self.action_dim).float().cos()
-        answers = {"actions": skill.decode_from(observations, skills, noise)}
-        if self.policy is not None and self.discrete:
-            answers["logits"] = self.policy.eval().logits(observations).nan_to_num(neginf=0.0)
-        elif self.policy is not None:
-            answers["choices"] = self.policy.eval().choose(observations, "greedy")  # type: ignore[operator]
-        return {name: [[round(x, 6) for x in row] for row in answer.tolist()] for name, answer in answers.items()}
+        """Answers of the networks to fixed questions, see `saving.golden`."""
+        return golden_answers(self.skill, self.policy)
 
     def save(
         self,

@@ -14,23 +14,25 @@ from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
-from torchmetrics import MeanMetric
 
 from dds_lightning.errors import UserError
 from dds_lightning.module import StageModule
 from dds_lightning.nn.bottleneck import Bottleneck, Skill
 from dds_lightning.nn.codebook import Codebook, CodebookInit
+from dds_lightning.nn.decoder import Decoder
 from dds_lightning.nn.diffusion import DiffusionDecoder, MLPDecoder, Sampler
 from dds_lightning.nn.encoder import ENCODERS
 from dds_lightning.nn.gaussian import GaussianBottleneck
 from dds_lightning.nn.normaliser import ActionBox, Normaliser
+from dds_lightning.nn.optimiser import forget_moments
 from dds_lightning.nn.settled import SettledCodes
-from dds_lightning.nn.usage import CodebookUsage
+from dds_lightning.nn.usage import SegmentMetrics
 from dds_lightning.saving.fingerprint import of_skills
 
 START_BATCHES = 64
 """Batches whose encodings start the codebook by k-means."""
 BOTTLENECKS: dict[str, type[Bottleneck]] = {"vq": Codebook, "gaussian": GaussianBottleneck}
+DECODERS: dict[str, type[Decoder]] = {"diffusion": DiffusionDecoder, "mlp": MLPDecoder}
 Batch = dict[str, Tensor]
 
 
@@ -145,25 +147,20 @@ class SkillModule(StageModule):
             ("noise_scale", noise_scale >= 0, "0 or more"),
             ("freeze_codes_after", freeze_codes_after is None or freeze_codes_after >= 1, "null or at least 1"),
             ("codebook_ema", codebook_ema is None or 0 < codebook_ema < 1, "null or in (0, 1)"),
-            ("trainable", not only_codebook or bottleneck == "vq", "all: a gaussian bottleneck has no codebook"),
+            ("trainable", not only_codebook or bottleneck == "vq", f"all: a {bottleneck} bottleneck has no codebook"),
             ("trainable", not only_codebook or codebook_ema is None, "more, or codebook_ema: null to give it a loss"),
         ]
         self._refuse(rules)
         space = BOTTLENECKS[bottleneck]
-        self.horizon, self.num_skills, self.discrete = horizon, num_skills, space.discrete
+        self.horizon, self.num_skills = horizon, num_skills
+        self.discrete = space.discrete
         self.normaliser = Normaliser(observation_dim)
         self.action_box = ActionBox(action_dim)
         shape = (horizon, hidden_dim, encoder_layers, encoder_heads, dropout)
         self.encoder = ENCODERS[encoder](observation_dim + action_dim, space.widths * skill_dim, *shape)
         self.bottleneck = space.build(self.hparams)
-        backbone = (observation_dim, action_dim, skill_dim, hidden_dim, decoder_blocks, dropout)
-        self.decoder: DiffusionDecoder | MLPDecoder = (
-            DiffusionDecoder(*backbone, diffusion_steps, beta_min, beta_max, time_dim, sampler, clip_actions)
-            if decoder == "diffusion"
-            else MLPDecoder(*backbone)
-        )
-        self.reconstruction_rmse = MeanMetric()
-        self.usage = CodebookUsage(num_skills)
+        self.decoder = DECODERS[decoder].build(self.hparams)
+        self.metrics = SegmentMetrics(num_skills if self.discrete else None)
         self._settled = SettledCodes()
         self._batch: Batch = {}  # of the step in progress: dead codes restart from it
         self._begin(init_from)
@@ -216,7 +213,8 @@ class SkillModule(StageModule):
         """
         codes = self.encode_segments(observations, actions, lengths).codes
         if codes is None:
-            raise UserError("bottleneck is gaussian: its skills have no codes; train with bottleneck: vq")
+            kind = self.hparams.bottleneck
+            raise UserError(f"bottleneck is {kind}: its skills have no codes; train with bottleneck: vq")
         return codes
 
     def decode(
@@ -245,12 +243,12 @@ class SkillModule(StageModule):
     @property
     def draws(self) -> int:
         """N, Gaussians that the decoder draws for one action."""
-        return int(self.decoder.draws)
+        return self.decoder.draws
 
     def decode_from(self, observations: Tensor, skills: Tensor, noise: Tensor) -> Tensor:
         """`decode` with given noise (N, B, A), the noise scale included: a function of its arguments."""
-        decoder: Any = self.decoder
-        return self.action_box.from_unit(decoder.denoise(noise, self.normaliser(observations), self.vectors(skills)))
+        unit = self.decoder.denoise(noise, self.normaliser(observations), self.vectors(skills))
+        return self.action_box.from_unit(unit)
 
     def on_fit_start(self) -> None:
         """Take the data's statistics and start the bottleneck, unless a checkpoint brought both."""
@@ -285,20 +283,23 @@ class SkillModule(StageModule):
         return total
 
     def after_step(self, step: int) -> None:
-        """Restart dead codes from this batch until the codebook has to settle, and freeze them in time."""
+        """Restart dead codes until the codebook has to settle, and freeze the codes in time."""
         h = self.hparams
         self._freeze_codes(step)
         last = h.freeze_codes_after or self.trainer.max_steps
         late = last > 0 and step > h.restart_until * last
-        if late or h.restart_threshold <= 0 or step % h.restart_every or "codebook" not in self.trained_parts:
-            return
+        due = h.restart_threshold > 0 and step % h.restart_every == 0
+        if due and not late and "codebook" in self.trained_parts:
+            self._restart_dead_codes(step)
+
+    def _restart_dead_codes(self, step: int) -> None:
+        """Move codes that are hardly used to where this batch needs them."""
         generator = torch.Generator().manual_seed(step)
-        moved = self.bottleneck.revive(lambda: self._encodings_of([self._batch]), h.restart_threshold, generator)
+        threshold = self.hparams.restart_threshold
+        moved = self.bottleneck.revive(lambda: self._encodings_of([self._batch]), threshold, generator)
+        rows = self.agree(self.bottleneck, list(moved.values()))
         optimizer: Any = self.optimizers()
-        for parameter, rows in zip(moved, self.agree(self.bottleneck, list(moved.values())), strict=True):
-            state = optimizer.state.get(parameter, {})
-            for name in state.keys() & {"exp_avg", "exp_avg_sq"}:  # the moments belonged to the code that died
-                state[name][rows] = 0.0
+        forget_moments(optimizer, dict(zip(moved, rows, strict=True)))
 
     def evaluate(self, batch: Batch, stage: str) -> None:
         """Log the loss, and update reconstruction error in action units (by sampling) and codebook usage."""
@@ -306,16 +307,13 @@ class SkillModule(StageModule):
         observations, actions = batch["observations"], batch["actions"]
         vectors = skill.vectors.repeat_interleave(actions.shape[1], dim=0)  # (B H, D)
         sampled = self.decode(observations.flatten(0, 1), vectors, noise_scale=1.0)
-        self.reconstruction_rmse.update((sampled - actions.flatten(0, 1)).square().mean(dim=-1))
+        self.metrics.update(sampled, actions.flatten(0, 1), skill.codes)
         log = {f"{stage}/{name}": value for name, value in {"loss": total, **terms}.items()}
         self.log_dict(log, batch_size=len(actions), sync_dist=True)
-        if skill.codes is not None:
-            self.usage.update(skill.codes)
 
     def on_validation_epoch_start(self) -> None:
         """Reset the metrics here: `Trainer.validate` leaves inference tensors, which a fit must not change."""
-        self.reconstruction_rmse.reset()
-        self.usage.reset()
+        self.metrics.reset()
 
     on_test_epoch_start = on_validation_epoch_start
 
@@ -328,9 +326,8 @@ class SkillModule(StageModule):
         self._log_epoch("test")
 
     def _log_epoch(self, stage: str) -> None:
-        usage = self.usage.compute() if self.discrete else {}
-        log = {"reconstruction_rmse": self.reconstruction_rmse.compute().sqrt(), **usage}
-        self.log_dict({f"{stage}/{name}": value for name, value in log.items()}, prog_bar=True, sync_dist=True)
+        log = {f"{stage}/{name}": value for name, value in self.metrics.compute().items()}
+        self.log_dict(log, prog_bar=True, sync_dist=True)
 
     def on_fit_end(self) -> None:
         """Warn where most of the codebook is idle."""

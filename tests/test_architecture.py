@@ -53,17 +53,18 @@ ROOMS = {
     "datamodules.partial_codes": "errors saving",
     "datamodules.relabelling": "envs errors tasks",
     "datamodules.robots": "errors saving skill tasks",
-    "datamodules.relabel": "console envs errors saving skill datamodules.partial_codes datamodules.relabelling "
-    "datamodules.trajectories",
+    "datamodules.semi_mdp": "errors saving",
+    "datamodules.relabel": "console envs errors skill datamodules.partial_codes datamodules.relabelling "
+    "datamodules.semi_mdp datamodules.trajectories",
     "datamodules.segments": "errors nn tasks datamodules.collect datamodules.loader datamodules.sources "
     "datamodules.trajectories",
     "datamodules.relabelled": "errors nn saving skill tasks datamodules.loader datamodules.partial_codes "
-    "datamodules.relabel "
-    "datamodules.relabelling datamodules.robots datamodules.sources datamodules.trajectories",
+    "datamodules.relabel datamodules.relabelling datamodules.robots datamodules.semi_mdp datamodules.sources "
+    "datamodules.trajectories",
     "datamodules.transitions": "envs errors skill datamodules.loader datamodules.relabel datamodules.relabelling "
     "datamodules.segments",
-    "datamodules.online": "errors online skill tasks datamodules.loader datamodules.relabel datamodules.relabelled "
-    "datamodules.relabelling datamodules.robots",
+    "datamodules.online": "errors online skill tasks datamodules.loader datamodules.relabelled datamodules.relabelling "
+    "datamodules.robots datamodules.semi_mdp",
     # training
     "dds_lightning.callbacks": "agent console envs errors module online policy rollout skill tasks",
     "dds_lightning.training": "callbacks configs console errors finetune module nn saving tasks",
@@ -71,7 +72,7 @@ ROOMS = {
     # what came of it
     "dds_lightning.interpret.views": "errors tasks",
     "dds_lightning.interpret.measure": "envs errors interpret.views tasks datamodules.physics datamodules.relabel "
-    "datamodules.trajectories",
+    "datamodules.semi_mdp datamodules.trajectories",
     "dds_lightning.interpret.draw": "envs errors interpret.measure interpret.views rollout saving tasks "
     "datamodules.inspection datamodules.trajectories",
     "dds_lightning.interpret.atlas": "interpret.draw interpret.measure interpret.views rollout saving tasks "
@@ -82,12 +83,12 @@ ROOMS = {
     "dds_lightning.sharing": "agent errors saving tasks training",
     "dds_lightning.pipeline": "agent baselines configs console envs errors interpret.draw online policy rollout saving "
     "skill study tasks training datamodules.collect datamodules.inspection datamodules.relabelled "
-    "datamodules.relabelling datamodules.relabel datamodules.sources",
+    "datamodules.relabelling datamodules.semi_mdp datamodules.sources",
     "dds_lightning.grid": "agent baselines configs console envs errors online rollout saving study tasks training "
     "datamodules.collect datamodules.relabelled datamodules.relabelling datamodules.sources",
     "dds_lightning.cli": "_version agent baselines configs console errors grid interpret.draw online pipeline policy "
     "rollout saving sharing skill study tasks training datamodules.collect datamodules.inspection datamodules.listing "
-    "datamodules.physics datamodules.relabel datamodules.relabelled datamodules.relabelling datamodules.sources",
+    "datamodules.physics datamodules.relabelled datamodules.relabelling datamodules.semi_mdp datamodules.sources",
     "dds_lightning.__main__": "cli",
 }
 """Room -> those it may import, apart from itself; `dds_lightning.` is left out in the second column."""

@@ -9,7 +9,7 @@ import pytest
 import torch
 from rich.console import Console
 
-from datamodules.relabel import Relabelled
+from datamodules.semi_mdp import Relabelled
 from datamodules.trajectories import Trajectories
 from dds_lightning._version import __version__
 from dds_lightning.callbacks.resume import rng_state, set_rng_state
@@ -132,9 +132,9 @@ def test_relabelled_data_of_a_newer_format_are_refused(tmp_path, monkeypatch):
     made = Relabelled(states[0], index[0], flat[0], states[1], flat[1], flat[2], index[1], index[2], num_skills=4)
     made.save(tmp_path / "now.safetensors", {})
     assert len(Relabelled.load(tmp_path / "now.safetensors")) == 1
-    monkeypatch.setattr("datamodules.relabel.FORMAT", 2)
+    monkeypatch.setattr("datamodules.semi_mdp.FORMAT", 2)
     made.save(tmp_path / "newer.safetensors", {})
-    monkeypatch.setattr("datamodules.relabel.FORMAT", 1)
+    monkeypatch.setattr("datamodules.semi_mdp.FORMAT", 1)
     with pytest.raises(UserError, match=rf"newer\.safetensors {NEWER}"):
         Relabelled.load(tmp_path / "newer.safetensors")
 

@@ -1,8 +1,10 @@
 """The skill model: every combination learns, the loss is the paper's, the codebook stays alive."""
 
 import copy
+import inspect
 import itertools
 import warnings
+from typing import get_args
 
 import lightning.pytorch as pl
 import pytest
@@ -10,7 +12,8 @@ import torch
 from torch.utils.data import DataLoader
 
 from dds_lightning.errors import UserError
-from dds_lightning.skill import SkillModule
+from dds_lightning.nn.encoder import ENCODERS
+from dds_lightning.skill import BOTTLENECKS, DECODERS, SkillModule
 
 SMALL = {
     "hidden_dim": 16,
@@ -38,6 +41,14 @@ def segments(size: int = 64, horizon: int = 5, modes: int = 4) -> dict[str, torc
     actions = direction[:, None] + 0.05 * torch.randn(size, horizon, 2, generator=generator)
     observations = torch.randn(size, horizon, 3, generator=generator)
     return {"observations": observations, "actions": actions.clamp(-1, 1), "kind": kind}
+
+
+@pytest.mark.parametrize(
+    ("setting", "table"), [("encoder", ENCODERS), ("decoder", DECODERS), ("bottleneck", BOTTLENECKS)]
+)
+def test_the_command_line_offers_every_row_of_a_table(setting, table):
+    assert get_args(inspect.signature(SkillModule).parameters[setting].annotation) == tuple(table)
+    assert all(f"``{name}``" in inspect.getdoc(SkillModule) for name in table)
 
 
 class Segments(pl.LightningDataModule):

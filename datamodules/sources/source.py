@@ -74,8 +74,8 @@ class Source:
         about: What such a data set is, in a few words.
         load: Reads the data for a task that `resolve_task` returned; None accepts any task.
         locate: The file or folder of the data set. It need not exist.
-        open_rows: Opens the data set of a task for reading single rows. The generator draws the episodes where the
-            source offers only some of them.
+        open_rows: Opens the data set of a task for reading single rows, where that is cheaper than to load all of it.
+            The generator draws the episodes where the source offers only some of them. None loads all.
         again: What helps where the data are damaged or incomplete and the message does not say more.
         recorded_in: The id of the environment that the data say they were recorded in, without reading their arrays;
             None where the format does not say.
@@ -85,6 +85,6 @@ class Source:
     about: str
     load: Callable[[str, Task | None], Trajectories]
     locate: Callable[[str], Path]
-    open_rows: Callable[[str, Task, np.random.Generator], AbstractContextManager[Recording]]
+    open_rows: Callable[[str, Task, np.random.Generator], AbstractContextManager[Recording]] | None = None
     again: str = "mend the data, or take others"
     recorded_in: Callable[[str], str | None] = lambda rest: None

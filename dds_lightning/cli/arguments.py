@@ -19,8 +19,10 @@ def data_spec(data: str) -> str:
     if path.suffix in (".hdf5", ".h5") and path.is_file():
         return f"d4rl:{data}"
     if ":" not in data:
-        raise UserError(
-            f"data: there is no folder or .hdf5 file {data!r}; give one, or local:DIR, minari:ID, d4rl:FILE or "
-            "arrays:DIR"
-        )
+        from datamodules.sources import SOURCES
+
+        kinds = ", ".join(f"{name}:{source.rest}" for name, source in SOURCES.items())
+        if path.is_file():
+            raise UserError(f"data: {data!r} is a file that does not end in .hdf5; say what it is, by one of {kinds}")
+        raise UserError(f"data: there is no folder or .hdf5 file {data!r}; give one, or one of {kinds}")
     return data

@@ -137,8 +137,8 @@ def relabel(
         out: File to write; without it the cache beside the checkpoint, where `dds policy fit` looks.
         **relabelling: Fields of `datamodules.relabelling.Relabelling`.
     """
-    from datamodules.relabel import Relabelled
     from datamodules.relabelled import RelabeledDataModule
+    from datamodules.semi_mdp import Relabelled
 
     settings = Relabelling(**relabelling).settings()
     module = RelabeledDataModule(task, data_spec(data), skill, **settings)
@@ -233,11 +233,8 @@ def report(directory: str, task: str | None = None) -> Report:
         task: File of the run's task, where its environment is in a module of your own.
     """
     from dds_lightning.study.report import report as draw
-    from dds_lightning.tasks import get_task
 
-    if task is not None:
-        get_task(task)  # from now on it is known by its name
-    return draw(directory)
+    return draw(directory, task)
 
 
 def data_check(data: str, task: str | None = None, horizon: int | None = None, replay: int = 0) -> Report:

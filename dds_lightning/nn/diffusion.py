@@ -1,12 +1,12 @@
 """Action decoders: skill vector and state to action, by denoising or directly (section 4.1, appendix A.1.2)."""
 
 import math
-from typing import Literal
+from typing import Any, Literal, Self
 
 import torch
 from torch import Tensor, nn
 
-from dds_lightning.nn.draws import normal
+from dds_lightning.nn.decoder import Decoder
 from dds_lightning.nn.dropout import Dropout
 
 Sampler = Literal["ddpm", "ddim"]
@@ -74,7 +74,7 @@ class ResidualMLP(nn.Module):
         return self.output(self.blocks(self.input(x)))
 
 
-class DiffusionDecoder(nn.Module):
+class DiffusionDecoder(Decoder):
     """Noise prediction network and its samplers; actions live in [-1, 1].
 
     Args:
@@ -113,9 +113,8 @@ class DiffusionDecoder(nn.Module):
         clip: bool = True,
         net: nn.Module | None = None,
     ) -> None:
-        super().__init__()
-        self.action_dim, self.diffusion_steps = action_dim, diffusion_steps
-        self.sampler, self.clip = sampler, clip
+        super().__init__(action_dim)
+        self.diffusion_steps, self.sampler, self.clip = diffusion_steps, sampler, clip
         width = action_dim + time_dim + skill_dim + observation_dim
         self.net = net or ResidualMLP(width, action_dim, hidden_dim, blocks, dropout)
         betas = vp_betas(diffusion_steps, beta_min, beta_max)
@@ -124,49 +123,24 @@ class DiffusionDecoder(nn.Module):
         times = torch.arange(1, diffusion_steps + 1)
         self.register_buffer("time_table", sinusoidal_embedding(times, time_dim))
 
+    @classmethod
+    def build(cls, settings: Any) -> Self:
+        """As `Decoder.build`."""
+        h = settings
+        schedule = (h.diffusion_steps, h.beta_min, h.beta_max, h.time_dim)
+        return cls(*_backbone(h), *schedule, h.sampler, h.clip_actions)
+
     def predict_noise(self, noisy: Tensor, t: Tensor, observations: Tensor, skills: Tensor) -> Tensor:
         """epsilon_psi(x_t, t, z, s): noisy (B, A), t (B,) in 0..T-1, observations (B, O), skills (B, D) to (B, A)."""
         return self.net(torch.cat([noisy, self.time_table[t], skills, observations], dim=-1))
 
     def loss(self, actions: Tensor, observations: Tensor, skills: Tensor) -> Tensor:
-        """Squared error of the predicted noise (equation 5), one t and one epsilon a row.
-
-        Args:
-            actions: (B, A) in [-1, 1].
-            observations: (B, O) normalised.
-            skills: (B, D).
-
-        Returns:
-            (B, A), not yet reduced: the sum over H and A stands beside the VQ terms.
-        """
+        """Squared error of the predicted noise (equation 5), one t and one epsilon a row; see `Decoder.loss`."""
         t = torch.randint(self.diffusion_steps, (len(actions),), device=actions.device)
         noise = torch.randn_like(actions)
         alpha_bar = self.alpha_bars[t, None]  # (B, 1)
         noisy = alpha_bar.sqrt() * actions + (1.0 - alpha_bar).sqrt() * noise
         return (self.predict_noise(noisy, t, observations, skills) - noise).square()
-
-    def sample(
-        self,
-        observations: Tensor,
-        skills: Tensor,
-        noise_scale: float = 1.0,
-        generator: torch.Generator | None = None,
-    ) -> Tensor:
-        """Denoise Gaussian noise into actions in T steps (section 4.4).
-
-        Args:
-            observations: (B, O) normalised.
-            skills: (B, D).
-            noise_scale: Factor on every Gaussian that is drawn, the first as well; 1 is the model's
-                distribution, less is closer to its mode, 0 is deterministic.
-            generator: Random stream; the global one by default.
-
-        Returns:
-            (B, A), in [-1, 1] when ``clip`` is set.
-        """
-        size = (len(observations), self.action_dim)
-        drawn = [normal(size, observations.device, generator) for _ in range(self.draws)]
-        return self.denoise(noise_scale * torch.stack(drawn), observations, skills)
 
     @property
     def draws(self) -> int:
@@ -174,16 +148,7 @@ class DiffusionDecoder(nn.Module):
         return self.diffusion_steps if self.sampler == "ddpm" else 1
 
     def denoise(self, noise: Tensor, observations: Tensor, skills: Tensor) -> Tensor:
-        """`sample` with given noise: a function of its arguments.
-
-        Args:
-            noise: (`draws`, B, A), the noise scale included.
-            observations: (B, O) normalised.
-            skills: (B, D).
-
-        Returns:
-            (B, A).
-        """
+        """T steps from Gaussian noise to actions (section 4.4), in [-1, 1] when ``clip`` is set."""
         draws = iter(noise)
         x = next(draws)
         for i in reversed(range(self.diffusion_steps)):
@@ -208,7 +173,7 @@ class DiffusionDecoder(nn.Module):
         raise AssertionError("unreachable: the loop returns at i = 0")
 
 
-class MLPDecoder(nn.Module):
+class MLPDecoder(Decoder):
     """The diffusion decoder's backbone as a plain regressor, for the architecture ablation (section 5.4).
 
     Args:
@@ -229,26 +194,24 @@ class MLPDecoder(nn.Module):
         blocks: int = 4,
         dropout: float = 0.1,
     ) -> None:
-        super().__init__()
+        super().__init__(action_dim)
         self.net = ResidualMLP(skill_dim + observation_dim, action_dim, hidden_dim, blocks, dropout)
 
+    @classmethod
+    def build(cls, settings: Any) -> Self:
+        """As `Decoder.build`."""
+        return cls(*_backbone(settings))
+
     def loss(self, actions: Tensor, observations: Tensor, skills: Tensor) -> Tensor:
-        """Squared error of the action (equation 13, first term); shapes as in `DiffusionDecoder.loss`."""
+        """Squared error of the action (equation 13, first term); see `Decoder.loss`."""
         return (self.sample(observations, skills) - actions).square()
 
-    def sample(
-        self,
-        observations: Tensor,
-        skills: Tensor,
-        noise_scale: float = 1.0,
-        generator: torch.Generator | None = None,
-    ) -> Tensor:
-        """Predict actions (B, A); there is no noise to scale or draw."""
-        del noise_scale, generator
+    def denoise(self, noise: Tensor, observations: Tensor, skills: Tensor) -> Tensor:
+        """Predict actions (B, A); ``noise`` (0, B, A) is empty."""
         return self.net(torch.cat([skills, observations], dim=-1)).tanh()
 
-    draws = 0
 
-    def denoise(self, noise: Tensor, observations: Tensor, skills: Tensor) -> Tensor:
-        """As `sample`; ``noise`` (0, B, A) is empty."""
-        return self.sample(observations, skills)
+def _backbone(settings: Any) -> tuple[int, int, int, int, int, float]:
+    """The arguments that both decoders have in common, from the settings of a `SkillModule`."""
+    h = settings
+    return h.observation_dim, h.action_dim, h.skill_dim, h.hidden_dim, h.decoder_blocks, h.dropout

@@ -1,8 +1,8 @@
 """Metrics in torchmetrics' form: they accumulate over an epoch, reset themselves and sync across processes."""
 
 import torch
-from torch import Tensor
-from torchmetrics import Metric
+from torch import Tensor, nn
+from torchmetrics import MeanMetric, Metric
 
 
 def perplexity(share: Tensor) -> Tensor:
@@ -42,3 +42,33 @@ class CodebookUsage(Metric):
         share = self.counts / self.counts.sum().clamp_min(1.0)  # (K,)
         used = (share >= self.threshold / len(share)).sum().float()
         return {"perplexity": perplexity(share), "codes_used": used, "dead_codes": len(share) - used}
+
+
+class SegmentMetrics(nn.Module):
+    """How well an epoch of held-out segments is decoded, and how their skills use the codebook where they have codes.
+
+    Args:
+        num_skills: K; None for continuous skills.
+    """
+
+    def __init__(self, num_skills: int | None) -> None:
+        super().__init__()
+        self.squared_error = MeanMetric()
+        self.usage = None if num_skills is None else CodebookUsage(num_skills)
+
+    def update(self, decoded: Tensor, actions: Tensor, codes: Tensor | None) -> None:
+        """Add decoded and true actions, (B H, A) each, and the codes (B,) of their segments."""
+        self.squared_error.update((decoded - actions).square().mean(dim=-1))
+        if self.usage is not None and codes is not None:
+            self.usage.update(codes)
+
+    def compute(self) -> dict[str, Tensor]:
+        """Return ``reconstruction_rmse``, in the unit of the actions, and what `CodebookUsage` has."""
+        usage = {} if self.usage is None else self.usage.compute()
+        return {"reconstruction_rmse": self.squared_error.compute().sqrt(), **usage}
+
+    def reset(self) -> None:
+        """Forget the epoch."""
+        self.squared_error.reset()
+        if self.usage is not None:
+            self.usage.reset()

@@ -152,8 +152,8 @@ def _fit(stage: str, best: str, publish: bool, run: Run, folder: Path, resuming:
 
 def _relabel(run: Run, folder: Path, resuming: bool) -> Mapping[str, Any]:
     """Fill the cache that `dds policy fit` reads."""
-    from datamodules.relabel import Relabelled
     from datamodules.relabelled import RelabeledDataModule
+    from datamodules.semi_mdp import Relabelled
 
     skill = str(run.output("skill", "checkpoint"))
     options = run.trainings.relabelling()

@@ -63,8 +63,12 @@ class Findings:
     markers: Mapping[str, Mapping[str, Any]]
 
     @classmethod
-    def read(cls, root: Path) -> Findings:
+    def read(cls, root: Path, asked: str | None = None) -> Findings:
         """Read a run directory.
+
+        Args:
+            root: A directory of `dds run`.
+            asked: Name or file of its task, see `recall_task`.
 
         Raises:
             UserError: The directory holds no evaluation, its task is unknown, or a stage was written by a newer
@@ -76,7 +80,7 @@ class Findings:
                 "finished at least its stage 'evaluate'"
             )
         refuse_links(root)
-        recall_task(root)
+        recall_task(root, asked)
         result = RolloutResult.load(root / "evaluate")
         episodes = result.episodes
         task = known_task(result.task)

@@ -36,11 +36,12 @@ DPI = 150
 # ---------------------------------------------------------------------- writing
 
 
-def write_report(run_dir: str | Path) -> dict[str, Any]:
+def write_report(run_dir: str | Path, task: str | None = None) -> dict[str, Any]:
     """Write `report/` of a run directory; every file whole or not at all.
 
     Args:
         run_dir: A directory of `dds run` with an evaluation.
+        task: Name or file of its task, see `recall_task`.
 
     Returns:
         Paths of the files by name, and the facts that `summary_lines` prints, as plain JSON values: `task`, `main` (the
@@ -55,7 +56,7 @@ def write_report(run_dir: str | Path) -> dict[str, Any]:
     from dds_lightning.console.reports import plain
     from dds_lightning.study.page import page
 
-    findings = Findings.read(Path(run_dir))
+    findings = Findings.read(Path(run_dir), task)
     folder = findings.root / "report"
     written: dict[str, Path] = {}
     tables = ("summary", "failures", "skills") if findings.task.measures_success else ("summary", "skills")
@@ -86,15 +87,15 @@ def write_report(run_dir: str | Path) -> dict[str, Any]:
     return {"report": text, **written, **plain(facts)}
 
 
-def report(run_dir: str | Path) -> Report:
-    """Write the report of a run directory again, and return what is in it.
+def report(run_dir: str | Path, task: str | None = None) -> Report:
+    """Write the report of a run directory again, and return what is in it; arguments as of `write_report`.
 
     Raises:
         UserError: See `write_report`.
     """
     from dds_lightning.console.reports import Report
 
-    written = write_report(run_dir)
+    written = write_report(run_dir, task)
     paths = [f"{name}: {path}" for name, path in written.items() if isinstance(path, Path)]
     return Report(written, [*summary_lines(written), *paths])
 

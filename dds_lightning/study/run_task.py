@@ -8,7 +8,7 @@ import yaml
 from dds_lightning.errors import UserError
 from dds_lightning.saving.files import written_whole
 from dds_lightning.saving.untrusted import read_yaml
-from dds_lightning.tasks import Task, definition, is_own, known_task, remember
+from dds_lightning.tasks import Task, definition, get_task, is_own, known_task, remember
 from dds_lightning.tasks.own import OwnCodeError, build_task
 
 TASK_FILE = "task.yaml"
@@ -21,12 +21,19 @@ def keep_task(run: Path, task: Task) -> None:
             part.write_text(yaml.safe_dump(definition(task), sort_keys=False), encoding="utf-8")
 
 
-def recall_task(run: Path) -> None:
+def recall_task(run: Path, asked: str | None = None) -> None:
     """Register the custom task of a run directory, so that it is found by name; does nothing if there is none.
 
+    Args:
+        run: The run directory.
+        asked: What the user gave as its task: the name or the file of one. Only a file that the user names may bring
+            code of its own.
+
     Raises:
-        UserError: The file does not define a task.
+        UserError: The file does not define a task, or there is no task `asked`.
     """
+    if asked is not None:
+        get_task(asked)
     path = run / TASK_FILE
     if not path.is_file():
         return

@@ -62,9 +62,7 @@ def find_subject(place: Path, seed: int = 0, asked: str | None = None) -> Subjec
         agent, trained = _skills_alone(place, seed), loose_task(asked, str(place))
         name = trained.name if trained else None
         return Subject(agent, name, None, None, f"skill checkpoint {_shown(place)}")
-    if asked is not None:
-        get_task(asked)  # from now on it is known by its name
-    recall_task(place)
+    recall_task(place, asked)
     data, task = _data_of(place)
     if not (place / "model.safetensors").is_file() and not (place / "agent" / "model.safetensors").is_file():
         checkpoint = place / "skill" / "last.ckpt"

@@ -85,9 +85,10 @@ def task_facts(task: Task) -> dict[str, Any]:
 
 def task_lines(task: Task) -> list[tuple[str, str]]:
     """Return the same facts for people, as (name, text) line by line."""
+    layout = f": {task.observation_layout}" if task.observation_layout else ""
     return [
         ("environment", task.env_id + (f", physics {task.physics}" if task.physics else "")),
-        ("observation", f"{task.observation_dim} numbers: {task.observation_layout}"),
+        ("observation", f"{task.observation_dim} numbers{layout}"),
         (
             "action",
             f"{task.action_dim} numbers from {bounds_text(task.action_low)} to {bounds_text(task.action_high)}: "

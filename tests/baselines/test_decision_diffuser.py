@@ -3,6 +3,8 @@
 import pytest
 import torch
 
+from datamodules import transitions
+from datamodules.relabelling import returns_to_go
 from datamodules.transitions import SequenceDataModule
 from dds_lightning.baselines.actors import ModuleActor
 from dds_lightning.baselines.decision_diffuser import DecisionDiffuser
@@ -76,6 +78,16 @@ def test_returns_to_go_and_steps_are_those_of_the_episodes():
     assert torch.allclose(returns[last, -1], rewards[last, -1])
     paid = 2.0 * batch["observations"][..., 1] * batch["actions"][..., 0]
     assert torch.allclose(rewards, paid, atol=1e-5)
+
+
+def test_returns_to_go_are_summed_up_once(monkeypatch):
+    calls = []
+    monkeypatch.setattr(transitions, "returns_to_go", lambda *given: calls.append(1) or returns_to_go(*given))
+    data = SequenceDataModule.from_trajectories(two_modes(20), horizon=4, batch_size=8)
+    data.statistics()
+    data.train_dataloader()
+    data.val_dataloader()
+    assert len(calls) == 1
 
 
 def test_it_plans_for_the_mode_that_pays():

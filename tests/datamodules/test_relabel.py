@@ -14,11 +14,11 @@ import torch
 from jsonargparse import ArgumentParser
 from safetensors.torch import save_file
 
-import datamodules.relabel as relabelling
 import datamodules.relabelled as relabelled
 from datamodules.relabel import Relabelled, relabel, relabel_key
 from datamodules.relabelled import RelabeledDataModule
 from datamodules.relabelling import Relabelling
+from datamodules.semi_mdp import STORED
 from datamodules.trajectories import Trajectories
 from dds_lightning.errors import UserError
 from dds_lightning.nn.precision import Choice
@@ -142,7 +142,7 @@ def test_a_file_that_is_something_else_is_refused(tmp_path, content):
 
 def _stored(trajectories, skill):
     made = relabel(trajectories, skill)
-    return {name: getattr(made, name).clone() for name in relabelling._STORED}
+    return {name: getattr(made, name).clone() for name in STORED}
 
 
 ABOUT = {"format": 1, "num_skills": 4, "key": {"data": "d"}}
@@ -284,7 +284,7 @@ IMPOSSIBLE = {
     "episodes": lambda made: {"episodes": made.episodes + 10**6},
     "observations": lambda made: {"observations": made.observations + 1},
     "next_observations": lambda made: {"next_observations": made.observations.clone()},
-    "fewer": lambda made: {name: getattr(made, name)[:-1].clone() for name in relabelling._STORED},
+    "fewer": lambda made: {name: getattr(made, name)[:-1].clone() for name in STORED},
 }
 
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from datamodules import collect_pointmaze, load_trajectories
-from datamodules.relabel import Relabelled
+from datamodules.semi_mdp import Relabelled
 from datamodules.trajectories import Trajectories
 from dds_lightning.cli import main
 from dds_lightning.errors import UserError, is_out_of_memory

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dds_lightning.nn.usage import CodebookUsage, perplexity
+from dds_lightning.nn.usage import CodebookUsage, SegmentMetrics, perplexity
 
 
 def test_perplexity_is_the_number_of_codes_that_are_used_alike():
@@ -41,3 +41,18 @@ def test_a_code_is_in_use_from_the_threshold_share_on():
 def test_before_the_first_code_nothing_is_in_use():
     found = CodebookUsage(3).compute()
     assert (found["codes_used"].item(), found["perplexity"].item()) == (0.0, 1.0)
+
+
+def test_an_epoch_of_segments_gives_the_root_of_the_mean_squared_error_and_the_usage_of_its_codes():
+    metrics = SegmentMetrics(num_skills=4)
+    metrics.update(torch.zeros(6, 2), torch.full((6, 2), 1.0), torch.tensor([0, 0, 1]))
+    metrics.update(torch.zeros(2, 2), torch.full((2, 2), 3.0), torch.tensor([1]))
+    found = metrics.compute()
+    assert found["reconstruction_rmse"].item() == pytest.approx((6 * 1 + 2 * 9) ** 0.5 / 8**0.5)
+    assert (found["codes_used"].item(), found["dead_codes"].item()) == (2, 2)
+    metrics.reset()
+    metrics.update(torch.zeros(1, 2), torch.full((1, 2), 0.5), torch.tensor([3]))
+    assert metrics.compute()["reconstruction_rmse"].item() == 0.5
+    continuous = SegmentMetrics(num_skills=None)
+    continuous.update(torch.zeros(1, 2), torch.full((1, 2), 0.5), None)
+    assert list(continuous.compute()) == ["reconstruction_rmse"]

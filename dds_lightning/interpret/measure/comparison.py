@@ -74,7 +74,8 @@ def cluster_skills(
     from scipy.cluster.vq import kmeans2
 
     if skill.discrete:
-        raise UserError("bottleneck is vq, expected gaussian: the skills are already discrete and need no clusters")
+        kind = skill.hparams.bottleneck
+        raise UserError(f"bottleneck is {kind}, expected gaussian: the skills are already discrete, without clusters")
     check_widths(trajectories, skill)
     skill.eval()
     means = []

@@ -13,7 +13,8 @@ import pandas as pd
 import torch
 from numpy.typing import NDArray
 
-from datamodules.relabel import Relabelled, relabel
+from datamodules.relabel import relabel
+from datamodules.semi_mdp import Relabelled
 from datamodules.trajectories import Trajectories
 from dds_lightning.interpret.measure.body import to_body
 from dds_lightning.tasks import Task

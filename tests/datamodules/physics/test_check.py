@@ -15,7 +15,7 @@ import pytest
 from datamodules import load_trajectories
 from datamodules.physics.check import LIMIT, NOISY_LIMIT, replay_check
 from datamodules.physics.states import FALLS, draw_steps
-from datamodules.sources import d4rl, minari
+from datamodules.sources import d4rl_recording, minari
 from datamodules.validation import DataError
 from dds_lightning.cli import main
 from dds_lightning.errors import UserError
@@ -317,13 +317,13 @@ def test_steps_that_start_with_a_cut_velocity_are_left_out_unless_the_simulators
 
 
 def test_no_more_is_read_than_the_steps_need(written: Write, monkeypatch: pytest.MonkeyPatch) -> None:
-    read, spans = d4rl.read_rows, []
+    read, spans = d4rl_recording.read_rows, []
 
     def spy(dataset: Any, where: str, start: int, stop: int, *rest: Any) -> Any:
         spans.append(stop - start)
         return read(dataset, where, start, stop, *rest)
 
-    for module in (d4rl, minari):
+    for module in (d4rl_recording, minari):
         monkeypatch.setattr(module, "read_rows", spy)
     for source in ("d4rl", "minari"):
         draw_steps(written(source, "antmaze-umaze"), get_task("antmaze-umaze"), 20)

@@ -16,6 +16,7 @@ from datamodules.sources.arrays import ARRAYS
 from datamodules.sources.rows import open_recording
 from datamodules.sources.source import Source
 from datamodules.sources.stat_hash import locate, stat_hash
+from dds_lightning.cli.arguments import data_spec
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import get_task
 
@@ -44,7 +45,6 @@ def toy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
         about="a toy",
         load=lambda rest, task: ARRAYS.load(str(folder.parent / rest), task),
         locate=lambda rest: folder.parent / rest,
-        open_rows=lambda rest, task, rng: ARRAYS.open_rows(str(folder.parent / rest), task, rng),
         recorded_in=lambda rest: "PointMaze_UMaze-v3",
     )
     monkeypatch.setitem(SOURCES, "toy", source)
@@ -75,6 +75,14 @@ def test_the_error_for_an_unknown_source_lists_the_known_ones(toy: str, spec: st
     for call in (lambda: load_trajectories(spec), lambda: stat_hash(spec), lambda: resolve_task(spec, TASK), opened):
         with pytest.raises(UserError, match=rf"got '{spec}', expected one of local:DIR .*toy:NUMBER \(a toy\)"):
             call()
+
+
+def test_a_path_that_no_source_claims_lists_them_and_a_file_is_not_called_missing(toy: str, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"there is no folder or .hdf5 file 'nowhere'.*toy:NUMBER"):
+        data_spec("nowhere")
+    (tmp_path / "table.csv").write_text("episode,reward\n")
+    with pytest.raises(UserError, match=r"table.csv' is a file that does not end in .hdf5.*toy:NUMBER"):
+        data_spec(str(tmp_path / "table.csv"))
 
 
 def test_a_hash_changes_with_names_sizes_and_times(tmp_path, monkeypatch):
