@@ -107,7 +107,11 @@ class OnlineDataModule(pl.LightningDataModule):
                 prior_rewards == "known" or data is not None,
                 "known: there are no prior data (data.data)",
             ),
-            ("prior_rewards", prior_rewards == "known" or prior_share < 1, "known, or data.prior_share below 1"),
+            (
+                "prior_rewards",
+                prior_rewards == "known" or self.prior_rows < batch_size,
+                "known, or a smaller data.prior_share: rewards are learnt from what is collected",
+            ),
             ("batch_size", batch_size >= 1, "at least 1"),
             ("updates", updates > 0, "positive"),
             ("random_steps", random_steps >= 1, "at least 1: the first batch needs transitions"),
@@ -144,6 +148,11 @@ class OnlineDataModule(pl.LightningDataModule):
     def batch_size(self) -> int:
         """B."""
         return int(self.hparams.batch_size)
+
+    @property
+    def prior_rows(self) -> int:
+        """How many transitions of a batch are prior data, the last ones."""
+        return 0 if self.hparams.data is None else round(self.batch_size * self.hparams.prior_share)
 
     def make_env(self) -> SkillEnv:
         """The task's environment, acted on by skills."""
@@ -295,7 +304,7 @@ class OnlineLoader:
 
     def _batch(self) -> dict[str, Tensor]:
         h, prior = self.data.hparams, self.data.prior
-        count = round(h.batch_size * h.prior_share) if prior is not None else 0
+        count = self.data.prior_rows
         batch = self.replay.sample(h.batch_size - count, self.generator)
         if prior is not None and count:
             past = prior.batch(torch.randint(len(prior), (count,), generator=self.generator))

@@ -301,7 +301,13 @@ class SACModule(StageModule):
     def on_fit_start(self) -> None:
         """Take the units and the skills to follow from the data, and policy and critics from offline training."""
         if self.follower is not None:
-            self.follower.start(self.trainer.datamodule.skill)  # type: ignore[attr-defined]
+            data: Any = self.trainer.datamodule  # type: ignore[attr-defined]
+            if data.prior_rows == data.batch_size:
+                raise UserError(
+                    f"model.follow is {self.hparams.follow}, but data.prior_share {data.hparams.prior_share} leaves no "
+                    "collected transition in a batch for the decoder to learn from: give a smaller share"
+                )
+            self.follower.start(data.skill)
         if not bool(self.normaliser.fitted):
             names = ["observation_mean", "observation_std"] + ([] if self.discrete else ["action_low", "action_high"])
             found = self.data_statistics(names, "fit it with an OnlineDataModule")

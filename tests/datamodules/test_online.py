@@ -77,6 +77,9 @@ def test_a_decoder_that_follows_goes_on_to_the_bit_and_acts_in_the_agent(dds, da
     assert all(torch.equal(value, other[name]) for name, value in weights.items())
     assert all(torch.equal(value, other_rows[name]) for name, value in rows.items() if "step" not in name)
     assert (rows["steps"] >= 1).all()
+    places = [f"--trainer.default_root_dir={tmp_path}", "--model.follow=1e-3", "--data.prior_share=1", *more[1:]]
+    answer = dds("online", "fit", *QUIET, *TINY, f"--data.task={TASK}", *words("discrete", skills), *places)
+    assert "data.prior_share 1.0 leaves no collected transition in a batch for the decoder" in told(answer.err)
     before, module = SkillModule.load(skills["discrete"]), SACModule.load(through)
     skill, _ = checkpoint_parts(str(skills["discrete"]), str(through))
     assert torch.equal(skill.bottleneck.vectors, before.bottleneck.vectors)
@@ -192,6 +195,17 @@ def test_a_full_replay_forgets_the_oldest():
         (
             [f"--data.skill={CHECKPOINTS / 'walker2d-medium-expert'}", "--data.task=halfcheetah-medium"],
             r"\(walker2d\), but data.task is halfcheetah-medium \(halfcheetah\), another robot: give skills of that",
+        ),
+        (
+            [
+                *("--data.skill={discrete}", "--data.data=local:x"),
+                *("--data.prior_rewards=unknown", "--data.prior_share=0.999"),
+            ],
+            "data.prior_rewards is unknown, expected known, or a smaller data.prior_share: rewards are learnt from",
+        ),
+        (
+            ["--data.skill={discrete}", "--ckpt_path={discrete}", "--model.offline=b.ckpt"],
+            "--ckpt_path is .*last.ckpt and --model.offline is b.ckpt: the first continues a training",
         ),
         (["--data.skill={discrete}", "--data.noise_scale=-1"], "data.noise_scale is -1.0, expected null or 0 or more"),
         (
