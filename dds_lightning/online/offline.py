@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dds_lightning.errors import UserError
 from dds_lightning.policy import PolicyModule
-from dds_lightning.saving.fingerprint import same, told_apart
+from dds_lightning.saving.fingerprint import cure_of_old, same, told_apart
 
 SHAPE = ("observation_dim", "hidden_dims", "fourier_features", "fourier_seen", "layer_norm")
 LESSONS, LESSON_SIZE, LESSON_RATE = 2_000, 512, 1e-3
@@ -52,7 +52,7 @@ def refuse_other_policy(policy: PolicyModule, path: str, skill_hash: str | None,
         was, found = told_apart(there.skill_hash, skill_hash)
         raise UserError(
             f"model.offline: {path} was trained on skill model {was}, data.skill is {found}: give the skill model that "
-            "it was trained on"
+            f"it was trained on{cure_of_old(there.skill_hash, skill_hash, policy.OF_DECODER)}"
         )
     if there.num_skills != choices:
         raise UserError(
