@@ -253,7 +253,8 @@ class OnlineLoader:
         size = (len(task.maze_map), len(task.maze_map[0])) if task.maze_map else (0, 0)
         envs = [data.make_env() for _ in range(h.num_envs)]
         self.collector = Collector(envs, self.seed, task.xy_to_cell if mapped else None, size)
-        self.replay = Replay(h.replay_size, data.observation_dim, 0 if data.space == "discrete" else data.choices)
+        codes = data.choices if data.space == "discrete" else None
+        self.replay = Replay(h.replay_size, data.observation_dim, 0 if codes else data.choices, codes)
         self.generator = torch.Generator().manual_seed(self.seed)
         self.updates = 0
         self.random: bool | None = None  # whether it begins with random choices; the module knows
@@ -329,7 +330,7 @@ class OnlineLoader:
         """Go on where `state_dict` was taken.
 
         Raises:
-            UserError: It is the replay of another task.
+            UserError: It is the replay of another task, or damaged.
         """
         if state["task"] != self.data.task.name:
             raise UserError(

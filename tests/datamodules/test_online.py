@@ -180,6 +180,40 @@ def test_a_full_replay_forgets_the_oldest():
         Replay(3, 1, 2).load_state_dict(replay.state_dict())
 
 
+def test_a_damaged_replay_is_refused_with_what_is_wrong():
+    def state():
+        replay, wide = Replay(5, 1, 0, num_codes=4), torch.ones(1)
+        for number in range(3):
+            replay.add(observations=wide, actions=number, rewards=0, next_observations=wide, discounts=1, dones=0)
+        return replay.state_dict()
+
+    def refused(state, sentence):
+        with pytest.raises(UserError, match=rf"the replay in the checkpoint is damaged \({sentence}"):
+            Replay(5, 1, 0, num_codes=4).load_state_dict(state)
+
+    Replay(5, 1, 0, num_codes=4).load_state_dict(state())
+    rows = state()["rows"]
+    refused({**state(), "rows": {n: c for n, c in rows.items() if n != "rewards"}}, "it lacks rewards")
+    refused({**state(), "rows": {**rows, "dones": rows["dones"][:2]}}, "dones has 2 rows, rewards has 3")
+    refused({**state(), "rows": {**rows, "rewards": rows["rewards"] + torch.nan}}, "rewards has numbers that are not")
+    refused({**state(), "rows": {**rows, "actions": rows["actions"] + 2}}, "codes run from 2 to 4, expected 0 to 3")
+    refused({**state(), "next": 10**9}, "its next row is 1000000000, with 3 of 5 rows")
+
+
+def test_a_collection_of_other_environments_is_not_taken_up(skills):
+    def loader(count):
+        module = OnlineDataModule(TASK, str(skills["discrete"]), random_steps=20, num_envs=count)
+        module.setup("fit")
+        return module.loader
+
+    state = loader(2).state_dict()
+    with pytest.raises(UserError, match=r"data\.num_envs is 3, but the checkpoint has begun of 2 environments"):
+        loader(3).load_state_dict(state)
+    state["collector"]["visits"] = torch.zeros(2, 2, dtype=torch.int64)
+    with pytest.raises(UserError, match=r"map of visits has \(2, 2\) cells, the task's maze \(5, 5\)"):
+        loader(2).load_state_dict(state)
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
