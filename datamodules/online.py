@@ -130,12 +130,13 @@ class OnlineDataModule(pl.LightningDataModule):
         prior, share, known = settings["data"], settings["prior_share"], settings["prior_rewards"] == "known"
         auto = "auto" in (settings["reward_scale"], settings["reward_shift"])
         number = "a number or null, as data.reward_shift: what is collected later is not known yet"
+        fewer = "known, or a smaller data.prior_share: rewards are learnt from what is collected"
         noise = settings["noise_scale"]
         rules = [
             ("reward_scale", not auto, number),
             ("prior_share", 0 <= share <= 1, "a share in [0, 1]"),
             ("prior_rewards", known or prior is not None, "known: there are no prior data (data.data)"),
-            ("prior_rewards", known or share < 1, "known, or data.prior_share below 1"),
+            ("prior_rewards", known or _prior_rows(settings) < settings["batch_size"], fewer),
             ("batch_size", settings["batch_size"] >= 1, "at least 1"),
             ("updates", settings["updates"] > 0, "positive"),
             ("random_steps", settings["random_steps"] >= 1, "at least 1: the first batch needs transitions"),
@@ -151,6 +152,11 @@ class OnlineDataModule(pl.LightningDataModule):
     def batch_size(self) -> int:
         """B."""
         return int(self.hparams.batch_size)
+
+    @property
+    def prior_rows(self) -> int:
+        """How many transitions of a batch are prior data, the last ones."""
+        return _prior_rows(self.hparams)
 
     def make_env(self) -> SkillEnv:
         """The task's environment, acted on by skills."""
@@ -237,6 +243,10 @@ class OnlineDataModule(pl.LightningDataModule):
             self.loader.collector.close()
 
 
+def _prior_rows(settings: Mapping[str, Any]) -> int:
+    return 0 if settings["data"] is None else round(settings["batch_size"] * settings["prior_share"])
+
+
 class OnlineLoader:
     """Batches from the replay and the prior data; the policy of the module in training collects in between.
 
@@ -251,7 +261,8 @@ class OnlineLoader:
         size = (len(task.maze_map), len(task.maze_map[0])) if task.maze_map else (0, 0)
         envs = [data.make_env() for _ in range(h.num_envs)]
         self.collector = Collector(envs, self.seed, task.xy_to_cell if mapped else None, size)
-        self.replay = Replay(h.replay_size, data.observation_dim, 0 if data.space == "discrete" else data.choices)
+        codes = data.choices if data.space == "discrete" else None
+        self.replay = Replay(h.replay_size, data.observation_dim, 0 if codes else data.choices, codes)
         self.generator = torch.Generator().manual_seed(self.seed)
         self.updates = 0
         self.random: bool | None = None  # whether it begins with random choices; the module knows
@@ -302,7 +313,7 @@ class OnlineLoader:
 
     def _batch(self) -> dict[str, Tensor]:
         h, prior = self.data.hparams, self.data.prior
-        count = round(h.batch_size * h.prior_share) if prior is not None else 0
+        count = self.data.prior_rows
         batch = self.replay.sample(h.batch_size - count, self.generator)
         if prior is not None and count:
             past = prior.batch(torch.randint(len(prior), (count,), generator=self.generator))
@@ -327,7 +338,7 @@ class OnlineLoader:
         """Go on where `state_dict` was taken.
 
         Raises:
-            UserError: It is the replay of another task.
+            UserError: It is the replay of another task, or damaged.
         """
         if state["task"] != self.data.task.name:
             raise UserError(

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from dds_lightning.envs.flatten import numbers
 from dds_lightning.errors import UserError
-from dds_lightning.saving.fingerprint import same, told_apart
+from dds_lightning.saving.fingerprint import cure_of_old, same, told_apart
 from dds_lightning.saving.golden import golden_answers
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ class DDSAgent(nn.Module):
             raise UserError(
                 f"the policy was trained on the codes of skill model {there}, this one is {here}: they do not "
                 "belong together; give the skills that it was trained with, or train a policy on these with "
-                "`dds policy fit --data.skill SKILL.ckpt`"
+                f"`dds policy fit --data.skill SKILL.ckpt`{cure_of_old(learnt_with, found, self.policy.OF_DECODER)}"
             )
 
     # ---------------------------------------------------------------- acting

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from dds_lightning.errors import UserError
-from dds_lightning.saving.fingerprint import same, told_apart
+from dds_lightning.saving.fingerprint import cure_of_old, same, told_apart
 
 if TYPE_CHECKING:
     from dds_lightning.module import StageModule
@@ -126,7 +126,7 @@ def refuse_other_skills(module: StageModule, source: StageModule, path: str) -> 
         was, found = told_apart(there, here)
         raise UserError(
             f"data.skill is skill model {found}, but model.init_from {path} was trained on the codes of skill model "
-            f"{was}: give that one as data.skill, or start anew"
+            f"{was}: give that one as data.skill, or start anew{cure_of_old(there, here, module.OF_DECODER)}"
         )
 
 

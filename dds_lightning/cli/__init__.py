@@ -18,7 +18,7 @@ from dds_lightning._version import __version__
 from dds_lightning.console.interrupts import Interrupted, caught
 from dds_lightning.errors import ToldAlreadyError, UserError, is_out_of_memory, printable, reason
 from dds_lightning.saving.files import DISK_ERRORS, expand
-from dds_lightning.training.stages import STAGES
+from dds_lightning.training.stages import STAGES, STARTS
 
 USAGE_ERROR = 2
 GOES_ON = ("run", "relabel", "online compare", "study run", "data collect", "data fetch")
@@ -171,7 +171,7 @@ def _interrupted(arguments: list[str], stop: Interrupted) -> str:
         same = shlex.join(["dds", *arguments])
         return f"interrupted before anything was saved; the same command begins again:\n  {same}"
     kept, skip = [], False
-    starts = ("--ckpt_path", "--model.init_from")  # a resumed training takes no initial weights
+    starts = ("--ckpt_path", *(f"--model.{name}" for name in STARTS))  # a resumed training takes no initial weights
     for argument in arguments:
         if not skip and not argument.startswith(starts):
             kept.append(argument)

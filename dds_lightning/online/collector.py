@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from dds_lightning.errors import UserError
 from dds_lightning.online.replay import Replay
 from dds_lightning.online.skill_env import SkillEnv, decode
 
@@ -124,9 +125,25 @@ class Collector:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on where `state_dict` was taken; episodes in progress are played again up to there."""
+        """Go on where `state_dict` was taken; episodes in progress are played again up to there.
+
+        Raises:
+            UserError: It is of another number of environments, of another map, or damaged.
+        """
+        counts = {name: len(state[name]) for name in ("begun", "returns", "success", *(["envs"] * bool(state["envs"])))}
+        for name, count in counts.items():
+            if count != len(self.envs):
+                raise UserError(
+                    f"data.num_envs is {len(self.envs)}, but the checkpoint has {name} of {count} environments: give "
+                    "the same number, or an earlier checkpoint if this one is damaged"
+                )
+        if (shape := tuple(state["visits"].shape)) != self.visits.shape:
+            raise UserError(
+                f"the checkpoint's map of visits has {shape} cells, the task's maze {self.visits.shape}: give that "
+                "task, or an earlier checkpoint if this one is damaged"
+            )
         self._started = bool(state["envs"])
-        for env, own in zip(self.envs, state["envs"], strict=False):
+        for env, own in zip(self.envs, state["envs"], strict=bool(state["envs"])):
             env.load_state_dict(own)
         self.generator.set_state(state["generator"])
         self.steps, self.decisions = state["steps"], state["decisions"]

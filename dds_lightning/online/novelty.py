@@ -61,7 +61,8 @@ class Novelty(nn.Module):
     def label(self, batch: Mapping[str, Tensor], x: Tensor, optimism: float) -> tuple[Tensor, Tensor]:
         """Rewards and terminations (B,), optimistic ones where the data do not say them; arguments as of `loss`.
 
-        The novelty is in units of the error at the beginning: 1 where nothing was learnt, 0 where everything was.
+        The novelty is in units of the error at the beginning: 1 where nothing was learnt, 0 where everything was. Call
+        `loss` on the first batch before, which finds that unit.
         """
         reward, end = self.outcome(x).unbind(dim=-1)
         bright = reward + optimism * self.error(x) / self.first.clamp_min(1e-12)

@@ -7,6 +7,7 @@ the prior data.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -14,7 +15,7 @@ from torch import Tensor
 
 from dds_lightning.errors import UserError
 from dds_lightning.policy import PolicyModule
-from dds_lightning.saving.fingerprint import same, told_apart
+from dds_lightning.saving.fingerprint import cure_of_old, same, told_apart
 
 SHAPE = ("observation_dim", "hidden_dims", "fourier_features", "fourier_seen", "layer_norm")
 LESSONS, LESSON_SIZE, LESSON_RATE = 2_000, 512, 1e-3
@@ -52,12 +53,35 @@ def refuse_other_policy(policy: PolicyModule, path: str, skill_hash: str | None,
         was, found = told_apart(there.skill_hash, skill_hash)
         raise UserError(
             f"model.offline: {path} was trained on skill model {was}, data.skill is {found}: give the skill model that "
-            "it was trained on"
+            f"it was trained on{cure_of_old(there.skill_hash, skill_hash, policy.OF_DECODER)}"
         )
     if there.num_skills != choices:
         raise UserError(
             f"data.skill has {choices} codes, but the policy in {path} chooses among {there.num_skills}: give the "
             "skill model that it was trained on"
+        )
+
+
+def refuse_other_networks(policy: PolicyModule, path: str, model: Mapping[str, Any], with_data: bool) -> None:
+    """Refuse an offline policy whose networks have another shape, or that needs the states of prior data.
+
+    Args:
+        policy: Of `path`.
+        path: Where it is, for the message.
+        model: Settings of the online module.
+        with_data: Whether there are prior data.
+
+    Raises:
+        UserError: A setting differs, or it is in closed form where there are no prior data.
+    """
+    there = policy.hparams
+    for name in SHAPE:
+        if model[name] != there[name]:
+            raise UserError(f"model.{name} is {model[name]}, but the policy in {path} has {there[name]}: give the same")
+    if there.awr == "closed_form" and not with_data:
+        raise UserError(
+            f"model.offline: the policy in {path} is in closed form and becomes a network in the states of prior data: "
+            "give them with data.data, or a policy trained with --model.awr=regression"
         )
 
 
@@ -77,21 +101,13 @@ def start_offline(module: Any, path: str, states: Tensor | None = None) -> None:
             there are no prior data.
     """
     policy = PolicyModule.load(path)
-    there, here = policy.hparams, module.hparams
+    here = module.hparams
     if not module.discrete:
         raise UserError(
             f"model.offline is {path}, a policy over codes, but the choices are {here.space}: expected discrete"
         )
     refuse_other_policy(policy, path, here.skill_hash, here.choices)
-    pairs = {name: (here[name], there[name]) for name in SHAPE}
-    for name, (ours, theirs) in pairs.items():
-        if ours != theirs:
-            raise UserError(f"model.{name} is {ours}, but the policy in {path} has {theirs}: give the same")
-    if there.awr == "closed_form" and states is None:
-        raise UserError(
-            f"model.offline: the policy in {path} is in closed form and becomes a network in the states of prior data: "
-            "give them with data.data, or a policy trained with --model.awr=regression"
-        )
+    refuse_other_networks(policy, path, here, states is not None)
     module.normaliser.load_state_dict(policy.normaliser.state_dict())
     module.features.load_state_dict(policy.features.state_dict())
     module.actor.net.load_state_dict(policy.actor.state_dict())
@@ -101,7 +117,7 @@ def start_offline(module: Any, path: str, states: Tensor | None = None) -> None:
         for name, value in mine.state_dict().items():
             member = torch.arange(len(value)) % 2 if value.ndim == 3 else slice(None)  # layer norms are shared
             value.copy_(given[name][member])
-    if there.awr == "closed_form":
+    if policy.hparams.awr == "closed_form":
         assert states is not None
         _teach(module, policy, states)
 

@@ -19,12 +19,14 @@ class Replay:
         size: Rows that it holds at most.
         observation_dim: O.
         action_dim: D numbers of an action; 0 for codes.
+        num_codes: K, where actions are codes; None leaves open how many there are.
     """
 
-    def __init__(self, size: int, observation_dim: int, action_dim: int) -> None:
+    def __init__(self, size: int, observation_dim: int, action_dim: int, num_codes: int | None = None) -> None:
         if size < 1:
             raise UserError(f"data.replay_size is {size}, expected at least 1")
         self.size, self.count, self.next = size, 0, 0
+        self.num_codes = num_codes
         wide, codes = (size, observation_dim), action_dim == 0
         self.columns: dict[str, Tensor] = {
             "observations": torch.empty(wide),  # memory is taken when rows are written
@@ -83,7 +85,7 @@ class Replay:
         """Take over what `state_dict` returned.
 
         Raises:
-            UserError: It has other columns: it is the replay of another task or another action space.
+            UserError: It is damaged, or has other columns: it is the replay of another task or another action space.
         """
         if state["size"] != self.size:
             raise UserError(
@@ -91,8 +93,13 @@ class Replay:
             )
         if "step_actions" in state["rows"]:
             self.keep_steps(*state["rows"]["step_actions"].shape[1:])
+        if wrong := self._damage(state["rows"], state["next"]):
+            raise UserError(
+                f"the replay in the checkpoint is damaged ({wrong}): take an earlier checkpoint, or start from its "
+                "weights with model.init_from"
+            )
         for name, column in self.columns.items():
-            if name not in state["rows"]:
+            if name not in state["rows"] and "step" in name:
                 raise UserError(
                     "model.follow is above 0, but the checkpoint's replay has no steps to learn from: go on with 0, or "
                     "start a new training"
@@ -106,3 +113,22 @@ class Replay:
             column[: len(found)] = found
             self.count = len(found)
         self.next = int(state["next"])
+
+    def _damage(self, rows: Mapping[str, Tensor], place: int) -> str | None:
+        """What is wrong with the columns of a checkpoint, whose next row goes to `place`; None if nothing is."""
+        if missing := [name for name in self.columns if name not in rows and "step" not in name]:
+            return f"it lacks {', '.join(missing)}"
+        count = len(rows["rewards"])
+        for name, column in rows.items():
+            if len(column) != count:
+                return f"{name} has {len(column)} rows, rewards has {count}"
+            if name not in ("step_observations", "step_actions") and not bool(torch.isfinite(column).all()):
+                return f"{name} has numbers that are not finite"  # beyond its last step a row is whatever memory held
+        if not 0 <= place < self.size or count > self.size or count not in (place, self.size):
+            return f"its next row is {place}, with {count} of {self.size} rows"
+        codes = rows["actions"]
+        if self.num_codes is not None and codes.ndim == 1 and count:
+            low, high = int(codes.min()), int(codes.max())
+            if low < 0 or high >= self.num_codes:
+                return f"codes run from {low} to {high}, expected 0 to {self.num_codes - 1}"
+        return None

@@ -255,22 +255,24 @@ class SACModule(StageModule):
     def loss(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """Sum of the losses of critics, policy and temperature; its terms and their statistics, detached."""
         features = self.embed(batch["observations"])  # (B, F)
+        terms: dict[str, Tensor] = {}
+        if self.novelty is not None:  # before the labels, whose unit the first batch sets
+            transition = self._transition(batch, features)
+            terms["novelty_loss"] = self.novelty.loss(batch, transition)
         with torch.no_grad():
             after = self.embed(batch["next_observations"])
             follow = self.actor.expect(after, self.support_mask, self._judge_target)
             next_v = follow.q - (self.alpha * follow.log_pi if self.hparams.backup_entropy else 0.0)
             rewards, dones = batch["rewards"], batch["dones"]
             if self.novelty is not None:
-                rewards, dones = self.novelty.label(batch, self._transition(batch, features), self.hparams.optimism)
+                rewards, dones = self.novelty.label(batch, transition, self.hparams.optimism)
             target = losses.td_target(rewards, batch["discounts"], dones, next_v)
         taken = features
         if not self.discrete:
             taken = torch.cat([features, self.action_box.to_unit(batch["actions"])], dim=-1)
         values = self._values(self.critic, taken)  # (N, B, K or 1)
         q = self.actor.of_taken(values, batch["actions"])  # (N, B)
-        terms = {"q_loss": losses.td(q, target)}
-        if self.novelty is not None:
-            terms["novelty_loss"] = self.novelty.loss(batch, self._transition(batch, features.detach()))
+        terms["q_loss"] = losses.td(q, target)
         learns = "actor" in self.learning
         with torch.set_grad_enabled(learns and torch.is_grad_enabled()):
             # Over codes the values of all choices are there already; over numbers the policy makes a new choice.
@@ -299,7 +301,13 @@ class SACModule(StageModule):
     def on_fit_start(self) -> None:
         """Take the units and the skills to follow from the data, and policy and critics from offline training."""
         if self.follower is not None:
-            self.follower.start(self.trainer.datamodule.skill)  # type: ignore[attr-defined]
+            data: Any = self.trainer.datamodule  # type: ignore[attr-defined]
+            if data.prior_rows == data.batch_size:
+                raise UserError(
+                    f"model.follow is {self.hparams.follow}, but data.prior_share {data.hparams.prior_share} leaves no "
+                    "collected transition in a batch for the decoder to learn from: give a smaller share"
+                )
+            self.follower.start(data.skill)
         if not bool(self.normaliser.fitted):
             names = ["observation_mean", "observation_std"] + ([] if self.discrete else ["action_low", "action_high"])
             found = self.data_statistics(names, "fit it with an OnlineDataModule")

@@ -10,7 +10,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -52,7 +52,7 @@ class SkillEnv(gym.Wrapper[NDArray[np.float32], Any, NDArray[np.float32], Any], 
         bound: The box of continuous skills reaches from -bound to bound.
 
     Raises:
-        UserError: Environment and skill model do not fit each other.
+        UserError: Environment and skill model do not fit each other, or a setting is outside its range.
     """
 
     def __init__(
@@ -80,6 +80,14 @@ class SkillEnv(gym.Wrapper[NDArray[np.float32], Any, NDArray[np.float32], Any], 
             bound=bound,
         )
         gym.Wrapper.__init__(self, env)
+        for name, fine, value, expected in (
+            ("gamma", 0 < gamma <= 1, gamma, "a discount in (0, 1]"),
+            ("discount", discount in get_args(Discount), discount, " or ".join(get_args(Discount))),
+            ("noise_scale", noise_scale is None or noise_scale >= 0, noise_scale, "None or 0 or more"),
+            ("bound", bound > 0, bound, "positive"),
+        ):
+            if not fine:
+                raise UserError(f"{name} is {value}, expected {expected}")
         self.skill = None if skill is None else skill.eval()
         self.horizon = 1 if skill is None else int(skill.horizon)
         self.gamma, self.discount, self.noise_scale = gamma, discount, noise_scale
@@ -124,9 +132,7 @@ class SkillEnv(gym.Wrapper[NDArray[np.float32], Any, NDArray[np.float32], Any], 
         """
         if self._observation is None:
             raise UserError("no episode has begun: call reset() before the first skill")
-        if isinstance(space := self.action_space, gym.spaces.Discrete) and not space.contains(np.int64(action)):
-            raise UserError(f"the action is {action}, expected a code from 0 to {space.n - 1}")
-        self.chosen = action
+        self.chosen = action if self.skill is None else _refuse_no_skill(action, self.action_space)
         self.over = False
         self._rewards: list[float] = []
         self._positions: list[Any] = []
@@ -194,6 +200,17 @@ class SkillEnv(gym.Wrapper[NDArray[np.float32], Any, NDArray[np.float32], Any], 
         self._observation = observation
         self._generator.set_state(state["decoder"])
         self._seeds.bit_generator.state = state["seeds"]
+
+
+def _refuse_no_skill(action: Any, space: gym.Space[Any]) -> NDArray[Any]:
+    """The action as an array, a code () or a skill vector (D,), if it is one of the space."""
+    found = np.asarray(action)
+    if isinstance(space, gym.spaces.Discrete):
+        if found.shape or found.dtype.kind not in "iu" or not 0 <= found < space.n:
+            raise UserError(f"the action is {action}, expected a code from 0 to {space.n - 1}, an integer")
+    elif found.shape != space.shape or found.dtype.kind not in "iuf" or not np.isfinite(found).all():
+        raise UserError(f"the action is {action}, expected a skill vector of {space.shape[0]} finite numbers")  # type: ignore[index]
+    return found
 
 
 @torch.inference_mode()

@@ -20,7 +20,7 @@ from dds_lightning.console.refusals import did_you_mean
 from dds_lightning.console.reports import Report, table
 from dds_lightning.errors import UserError
 from dds_lightning.interpret.draw.online import plot_comparison
-from dds_lightning.online.offline import refuse_other_policy
+from dds_lightning.online.offline import refuse_other_networks, refuse_other_policy
 from dds_lightning.online.parts import checkpoint_parts
 from dds_lightning.pipeline.evaluating import publish_played
 from dds_lightning.policy import PolicyModule
@@ -160,7 +160,10 @@ def _refuse_misfits(configs: Mapping[str, Facts]) -> None:
                 f"--{other}"
             )
         if path := config["model"]["offline"]:
-            refuse_other_policy(PolicyModule.load(path), path, data.skill_hash, data.choices)
+            policy = PolicyModule.load(path)
+            refuse_other_policy(policy, path, data.skill_hash, data.choices)
+            sizes = {"observation_dim": data.observation_dim}
+            refuse_other_networks(policy, path, {**config["model"], **sizes}, data.hparams.data is not None)
 
 
 def _settings(config: Facts) -> dict[str, Any]:

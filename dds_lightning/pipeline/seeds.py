@@ -34,6 +34,7 @@ from dds_lightning.saving.files import written_whole
 from dds_lightning.saving.run_directory import duration, locked
 from dds_lightning.study.statistics import iqm
 from dds_lightning.study.tables import BEST, SKILL, markdown
+from dds_lightning.training.stages import run_stages
 
 REPORT, TABLE, FIGURE = "seeds.md", "seeds.csv", "seeds.png"
 
@@ -53,7 +54,7 @@ def run_seeds(wanted: RunSettings, count: int) -> Report:
         raise UserError(f"--seeds is {count}, expected at least 1")
     seeds = range(wanted.seed, wanted.seed + count)
     refuse_seed("--seed", seeds[-1])
-    Run(wanted)
+    _refuse_start_of_one_seed(Run(wanted), seeds)
     workers = 1 if wanted.workers is None else wanted.workers
     runs = {
         seed: replace(wanted, seed=seed, out=wanted.out / f"seed-{seed}", jobs=1, workers=workers) for seed in seeds
@@ -68,6 +69,20 @@ def run_seeds(wanted: RunSettings, count: int) -> Report:
             raise errors[0]
         made = [working[seed].result() for seed in seeds]
         return _report(wanted, made, time.monotonic() - started)
+
+
+def _refuse_start_of_one_seed(run: Run, seeds: range) -> None:
+    """Refuse that every seed starts from weights that belong to one of them: the others have skills of their own."""
+    for stage in run_stages():
+        for name, path in run.trainings.starts(stage).items():
+            for seed in seeds if len(seeds) > 1 else ():
+                place = run.out / f"seed-{seed}"
+                if path.resolve().is_relative_to(place.resolve()):
+                    raise UserError(
+                        f"{stage}: model.{name} is {path}, of seed {seed} alone, but with --seeds {len(seeds)} every "
+                        f"seed would start from it: give weights from outside of {run.out}, or do each seed by itself "
+                        f"(`dds run {run.wanted.task} --seed {seed} --out {place} --{stage}.model.{name}={path}`)"
+                    )
 
 
 def _error(future: Future[Any]) -> BaseException | None:

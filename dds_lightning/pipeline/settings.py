@@ -21,7 +21,7 @@ from dds_lightning.tasks import Task, get_task, is_own
 from dds_lightning.training.alone import run_alone
 from dds_lightning.training.monitors import refuse_late_validation
 from dds_lightning.training.stage_cli import StageCLI, parsed
-from dds_lightning.training.stages import STAGES, preset_configs, run_stages
+from dds_lightning.training.stages import STAGES, STARTS, preset_configs, run_stages
 
 WATCH_EPISODES = 10
 """Episodes of each evaluation while the policy trains."""
@@ -249,7 +249,7 @@ class Trainings:
     def starts(self, stage: str) -> dict[str, Path]:
         """The checkpoints from whose weights a training starts, by the setting that names them."""
         model = self._parsed[stage].settings.model
-        return {name: expand(model[name]) for name in ("init_from", "offline") if model.get(name)}
+        return {name: expand(model[name]) for name in STARTS if model.get(name)}
 
     def is_own(self, path: Path) -> bool:
         """Whether this run makes a file: what holds it may not be there yet, or be made anew."""
@@ -286,7 +286,8 @@ class Trainings:
     def _words(self, stage: str, spec: str, skill: Path | None, resume: Path | None) -> list[str]:
         arguments = self.arguments(stage, spec, skill)
         if resume is not None:
-            arguments += [f"--ckpt_path={resume}", "--model.init_from=null"]
+            starts = [f"--model.{name}=null" for name in STARTS if name in self._parsed[stage].settings.model]
+            arguments += [f"--ckpt_path={resume}", *starts]
         return arguments
 
     def fit(self, stage: str, spec: str, skill: Path | None = None, resume: Path | None = None) -> Report:
@@ -305,8 +306,9 @@ class Trainings:
         if skill is not None:
             cli.settings.data.skill = str(skill)
         if resume is not None:
-            if "init_from" in cli.settings.model:
-                cli.settings.model.init_from = None
+            for name in STARTS:
+                if name in cli.settings.model:
+                    cli.settings.model[name] = None
             cli.resume(resume)
         return cli.build().execute()
 

@@ -12,6 +12,7 @@ from datamodules.relabelling import Relabelling
 from dds_lightning.errors import UserError
 from dds_lightning.tasks import Task
 from dds_lightning.training.stage_cli import StageCLI
+from dds_lightning.training.stages import STARTS
 
 
 def refuse_settings(parsed: Mapping[str, StageCLI], task: Task) -> None:
@@ -46,7 +47,7 @@ def refuse_settings(parsed: Mapping[str, StageCLI], task: Task) -> None:
 
 def _chosen(model: Mapping[str, Any]) -> dict[str, Any]:
     """Settings of a model without the checkpoints that it would read."""
-    return {name: value for name, value in model.items() if name not in ("init_from", "offline")}
+    return {name: value for name, value in model.items() if name not in STARTS}
 
 
 def _try_data(cli: StageCLI, data: Mapping[str, Any]) -> None:

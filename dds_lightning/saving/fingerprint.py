@@ -70,6 +70,22 @@ def told_apart(one: str, other: str) -> tuple[str, str]:
     return short(codes), short(other_codes)
 
 
+def cure_of_old(policy: str, skills: str, whole: bool) -> str:
+    """What ends the message about a policy that does not fit these skills, where it may be its age alone.
+
+    Args:
+        policy: Fingerprint that the policy keeps.
+        skills: Fingerprint of the skill model.
+        whole: As of `same`.
+    """
+    if whole or _JOINT in policy or _JOINT not in skills:
+        return ""
+    return (
+        "; if only their decoder was tuned since, publish this policy of version 0.1.0 once with the skills that it "
+        "was trained with (`dds publish - DIR --skill THOSE.ckpt --policy POLICY.ckpt`), and give DIR as the policy"
+    )
+
+
 def completed(policy: Mapping[str, Any], state: Mapping[str, Tensor], skill: Any) -> Mapping[str, Any]:
     """Settings of a published policy, which learns the codes' fingerprint where it knew only the whole model's.
 

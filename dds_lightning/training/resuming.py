@@ -12,11 +12,11 @@ from dds_lightning.errors import UserError
 from dds_lightning.finetune import read
 from dds_lightning.saving.checkpoint import load_ckpt, stage_of
 from dds_lightning.saving.files import expand
-from dds_lightning.training.stages import Stage
+from dds_lightning.training.stages import STARTS, Stage
 
 PATHS = (
-    *("data.data", "data.skill", "data.relabelled", "data.cache", "model.init_from", "checkpoint.dirpath"),
-    *("trainer.default_root_dir", "ckpt_path"),
+    *("data.data", "data.skill", "data.relabelled", "data.cache", "checkpoint.dirpath"),
+    *("trainer.default_root_dir", "ckpt_path", *(f"model.{name}" for name in STARTS)),
 )
 """Settings that may begin with `~`, also in a file."""
 

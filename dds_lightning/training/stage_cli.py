@@ -40,7 +40,7 @@ from dds_lightning.training.resuming import (
     requeued_checkpoint,
     take_shape,
 )
-from dds_lightning.training.stages import get_stage
+from dds_lightning.training.stages import STARTS, get_stage
 from dds_lightning.training.threads import HELP, refuse_threads
 from dds_lightning.training.trainer import THREADS, TrainingSettings, log_places, trainer_settings, trial_trainer
 
@@ -153,13 +153,13 @@ class StageCLI(LightningCLI):
             UserError: It cannot be read, is another stage's, or was trained with settings other than those given.
         """
         settings = self.settings
-        if settings.model.get("init_from") is not None:
-            if any(argument.startswith("--model.init_from") for argument in self.arguments):
+        for name in (name for name in STARTS if settings.model.get(name) is not None):
+            if any(argument.startswith(f"--model.{name}") for argument in self.arguments):
                 raise UserError(
-                    f"--ckpt_path is {path} and --model.init_from is {settings.model.init_from}: the first continues "
-                    "a training, the second starts a new one from weights; give one of them"
+                    f"--ckpt_path is {path} and --model.{name} is {settings.model[name]}: the first continues a "
+                    "training, the second starts a new one from weights; give one of them"
                 )
-            settings.model.init_from = None  # a file of settings says how the training began that goes on here
+            settings.model[name] = None  # a file of settings says how the training began that goes on here
         settings.ckpt_path = str(path)
         self.checkpoint = load_checkpoint(str(path), self.stage.name)
         trained = {f"model.{name}": value for name, value in self.checkpoint["hyper_parameters"].items()}

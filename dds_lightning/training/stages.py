@@ -105,6 +105,8 @@ def _baseline(
     )
 
 
+STARTS = ("init_from", "offline")
+"""Settings of a module that name a checkpoint from whose weights a new training starts."""
 _LATENT = ("observation_dim", "skill_dim", "skill_hash")
 _SKILL = {"skill": "data.skill"}
 

@@ -77,6 +77,9 @@ def test_a_decoder_that_follows_goes_on_to_the_bit_and_acts_in_the_agent(dds, da
     assert all(torch.equal(value, other[name]) for name, value in weights.items())
     assert all(torch.equal(value, other_rows[name]) for name, value in rows.items() if "step" not in name)
     assert (rows["steps"] >= 1).all()
+    places = [f"--trainer.default_root_dir={tmp_path}", "--model.follow=1e-3", "--data.prior_share=1", *more[1:]]
+    answer = dds("online", "fit", *QUIET, *TINY, f"--data.task={TASK}", *words("discrete", skills), *places)
+    assert "data.prior_share 1.0 leaves no collected transition in a batch for the decoder" in told(answer.err)
     before, module = SkillModule.load(skills["discrete"]), SACModule.load(through)
     skill, _ = checkpoint_parts(str(skills["discrete"]), str(through))
     assert torch.equal(skill.bottleneck.vectors, before.bottleneck.vectors)
@@ -177,6 +180,40 @@ def test_a_full_replay_forgets_the_oldest():
         Replay(3, 1, 2).load_state_dict(replay.state_dict())
 
 
+def test_a_damaged_replay_is_refused_with_what_is_wrong():
+    def state():
+        replay, wide = Replay(5, 1, 0, num_codes=4), torch.ones(1)
+        for number in range(3):
+            replay.add(observations=wide, actions=number, rewards=0, next_observations=wide, discounts=1, dones=0)
+        return replay.state_dict()
+
+    def refused(state, sentence):
+        with pytest.raises(UserError, match=rf"the replay in the checkpoint is damaged \({sentence}"):
+            Replay(5, 1, 0, num_codes=4).load_state_dict(state)
+
+    Replay(5, 1, 0, num_codes=4).load_state_dict(state())
+    rows = state()["rows"]
+    refused({**state(), "rows": {n: c for n, c in rows.items() if n != "rewards"}}, "it lacks rewards")
+    refused({**state(), "rows": {**rows, "dones": rows["dones"][:2]}}, "dones has 2 rows, rewards has 3")
+    refused({**state(), "rows": {**rows, "rewards": rows["rewards"] + torch.nan}}, "rewards has numbers that are not")
+    refused({**state(), "rows": {**rows, "actions": rows["actions"] + 2}}, "codes run from 2 to 4, expected 0 to 3")
+    refused({**state(), "next": 10**9}, "its next row is 1000000000, with 3 of 5 rows")
+
+
+def test_a_collection_of_other_environments_is_not_taken_up(skills):
+    def loader(count):
+        module = OnlineDataModule(TASK, str(skills["discrete"]), random_steps=20, num_envs=count)
+        module.setup("fit")
+        return module.loader
+
+    state = loader(2).state_dict()
+    with pytest.raises(UserError, match=r"data\.num_envs is 3, but the checkpoint has begun of 2 environments"):
+        loader(3).load_state_dict(state)
+    state["collector"]["visits"] = torch.zeros(2, 2, dtype=torch.int64)
+    with pytest.raises(UserError, match=r"map of visits has \(2, 2\) cells, the task's maze \(5, 5\)"):
+        loader(2).load_state_dict(state)
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
@@ -192,6 +229,17 @@ def test_a_full_replay_forgets_the_oldest():
         (
             [f"--data.skill={CHECKPOINTS / 'walker2d-medium-expert'}", "--data.task=halfcheetah-medium"],
             r"\(walker2d\), but data.task is halfcheetah-medium \(halfcheetah\), another robot: give skills of that",
+        ),
+        (
+            [
+                *("--data.skill={discrete}", "--data.data=local:x"),
+                *("--data.prior_rewards=unknown", "--data.prior_share=0.999"),
+            ],
+            "data.prior_rewards is unknown, expected known, or a smaller data.prior_share: rewards are learnt from",
+        ),
+        (
+            ["--data.skill={discrete}", "--ckpt_path={discrete}", "--model.offline=b.ckpt"],
+            "--ckpt_path is .*last.ckpt and --model.offline is b.ckpt: the first continues a training",
         ),
         (["--data.skill={discrete}", "--data.noise_scale=-1"], "data.noise_scale is -1.0, expected null or 0 or more"),
         (

@@ -67,3 +67,17 @@ def test_unknown_rewards_are_replaced_and_known_ones_are_not():
     same = module.loss(changed)[1]["q_loss"]
     torch.manual_seed(1)
     assert same == module.loss(batch)[1]["q_loss"]
+
+
+def test_the_first_target_is_as_small_as_all_others():
+    """A first bonus without a unit would be about 1e10, and Adam's second moment would then hold the critics still."""
+    torch.manual_seed(0)
+    module = SACModule(3, "discrete", 4, hidden_dims=[16], prior_unknown=True).train()
+    batch = {"observations": torch.randn(64, 3), "actions": torch.randint(4, (64,)), "rewards": -torch.ones(64)}
+    batch |= {"next_observations": torch.randn(64, 3), "discounts": torch.full((64,), 0.9), "dones": torch.zeros(64)}
+    batch["known"] = torch.arange(64) < 32
+    _, terms = module.loss(batch)
+    assert terms["q_loss"] < 2 * 4**2  # two critics; a reward near 0 and a bonus near 1
+    x = module._transition(batch, module.embed(batch["observations"]))
+    with torch.no_grad():
+        assert module.novelty.first == module.novelty.error(x[:32]).mean()

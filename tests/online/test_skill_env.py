@@ -1,5 +1,6 @@
 """Skills as actions: rewards and ends worked out by hand, Gymnasium's own checker, vectors, and other libraries."""
 
+import re
 import warnings
 
 import gymnasium as gym
@@ -153,9 +154,28 @@ def test_what_is_no_skill_is_refused():
     with pytest.raises(UserError, match=r"no episode has begun: call reset\(\) before the first skill"):
         env.step(0)
     env.reset(seed=0)
-    for code in (-1, 4):
-        with pytest.raises(UserError, match=f"the action is {code}, expected a code from 0 to 3"):
+    for code in (-1, 4, 1.7, np.array([1]), None, "a"):
+        with pytest.raises(UserError, match=re.escape(f"the action is {code}, expected a code from 0 to 3")):
             env.step(code)
+    env = SkillEnv(Count(5), skill_of(bottleneck="gaussian"))
+    env.reset(seed=0)
+    for vector in (np.zeros(7), np.full(8, np.nan), 0):
+        with pytest.raises(UserError, match="expected a skill vector of 8 finite numbers"):
+            env.step(vector)
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"gamma": 2.0}, r"gamma is 2.0, expected a discount in \(0, 1\]"),
+        ({"discount": "steps"}, "discount is steps, expected per_skill or per_step"),
+        ({"noise_scale": -1.0}, "noise_scale is -1.0, expected None or 0 or more"),
+        ({"bound": 0.0}, "bound is 0.0, expected positive"),
+    ],
+)
+def test_settings_out_of_range_are_refused(settings, sentence):
+    with pytest.raises(UserError, match=sentence):
+        SkillEnv(Count(5), skill_of(), **settings)
 
 
 @pytest.mark.parametrize(

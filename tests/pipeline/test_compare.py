@@ -1,5 +1,6 @@
 """`dds online compare`: a row for each variant, one figure, and nothing done twice."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import pytest
 
 from dds_lightning.interpret.draw.online import on_one_grid
 from dds_lightning.pipeline.compare import Comparison
-from tests.fits import TASK, of_data, skill_of, told
+from tests.fits import POLICY, QUIET, TASK, call, of_data, skill_of, told
 
 TINY = ["--data.batch_size=16", "--data.random_steps=60", "--data.num_envs=2", "--data.updates=0.1"]
 TINY += ["--model.hidden_dims=[16]", "--trainer.log_every_n_steps=2", "--trainer.enable_progress_bar=false"]
@@ -87,6 +88,19 @@ def test_skills_of_the_wrong_kind_are_refused_before_the_first_training(dds, tmp
     answer = dds("online", "compare", TASK, "--skill", gaussian, "--out", tmp_path / "out")
     assert answer.status == 2
     assert "whose skills are continuous, expected discrete: give it as --gaussian" in told(answer.err)
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_offline_policy_with_other_networks_is_refused_before_the_first_training(dds, tmp_path):
+    data = of_data(tmp_path / "data")
+    skill = skill_of(data, tmp_path / "skill", 1)
+    fit = ["policy", "fit", *data, *QUIET, *POLICY, f"--data.skill={skill}", "--trainer.max_steps=1"]
+    assert call(*fit, f"--checkpoint.dirpath={tmp_path}", f"--trainer.default_root_dir={tmp_path}") == 0
+    (spec,) = [word.partition("=")[2] for word in data if word.startswith("--data.data=")]
+    files = ["--skill", skill, "--data", spec, "--policy", tmp_path / "last.ckpt"]
+    answer = dds("online", "compare", TASK, *files, "--out", tmp_path / "out")
+    assert answer.status == 2
+    assert re.search(r"model.hidden_dims is \[256, 256\], but the policy in .* has \[16\]: give", told(answer.err))
     assert not (tmp_path / "out").exists()
 
 

@@ -4,6 +4,7 @@ import pytest
 
 from dds_lightning.errors import UserError
 from dds_lightning.pipeline.context import Run
+from dds_lightning.pipeline.seeds import run_seeds
 from dds_lightning.pipeline.settings import RunSettings
 from dds_lightning.pipeline.steps import STEPS, reading_starts
 from tests.pipeline.test_run import SMALL, TASK, call
@@ -37,3 +38,11 @@ def test_learning_online_is_done_again_when_the_policy_it_starts_from_was(tmp_pa
     (tmp_path / "other.ckpt").write_bytes(b"weights of another training")
     assert online(tmp_path / "other.ckpt")[1] != settings
     assert online(tmp_path / "other.ckpt")[2] == former == {k: v for k, v in settings.items() if k != "starts"}
+
+
+def test_several_seeds_do_not_start_from_the_policy_of_one(tmp_path):
+    path = tmp_path / "runs" / "seed-4" / "policy" / "last.ckpt"
+    asked = RunSettings.with_preset(TASK, tmp_path / "runs", seed=3, stages={"online": (f"--model.offline={path}",)})
+    with pytest.raises(UserError, match=r"online: model\.offline is .*, of seed 4 alone, but with --seeds 2"):
+        run_seeds(asked, 2)
+    assert not (tmp_path / "runs").exists()

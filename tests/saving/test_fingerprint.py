@@ -93,6 +93,23 @@ def test_an_offline_policy_belongs_to_the_codes_and_an_online_one_to_the_decoder
         DDSAgent(changed(DECODER), policy_of(kind, learnt_with))
 
 
+def test_a_policy_of_version_0_1_0_is_cured_as_its_message_says(dds, tmp_path):
+    def saved(module, name):
+        torch.save({"state_dict": module.state_dict(), "hyper_parameters": dict(module.hparams)}, tmp_path / name)
+        return tmp_path / name
+
+    old, tuned = policy_of("offline", by_hand(skill())), changed(DECODER)
+    with pytest.raises(UserError, match=r"publish this policy of version 0.1.0 once .*`dds publish - DIR --skill"):
+        DDSAgent(tuned, old)
+    with pytest.raises(UserError) as newer:
+        DDSAgent(changed("bottleneck.vectors"), policy_of("offline", skill().fingerprint()))
+    assert "0.1.0" not in str(newer.value)
+    given = ["--skill", saved(skill(), "skill.ckpt"), "--policy", saved(old, "policy.ckpt")]
+    answer = dds("publish", "-", tmp_path / "agent", *given)
+    assert answer.status == 0, answer.err
+    DDSAgent(tuned, PolicyModule.load(tmp_path / "agent"))
+
+
 @pytest.mark.parametrize("name", ["antmaze-large-diverse", "walker2d-medium-expert"])
 def test_a_shipped_policy_of_version_0_1_0_plays_with_its_skills_when_their_decoder_was_tuned(name):
     kept = yaml.safe_load((CHECKPOINTS / name / "config.yaml").read_text())["policy"]["skill_hash"]
