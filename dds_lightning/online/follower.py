@@ -19,6 +19,7 @@ from typing import Any
 from torch import Tensor, nn
 
 import dds_lightning.losses as losses
+from dds_lightning.errors import UserError
 from dds_lightning.skill import SkillModule
 
 CLIP = 20.0
@@ -48,6 +49,14 @@ class Follower(nn.Module):
         """Begin as a skill model, unless a checkpoint brought the weights."""
         if not bool(self.skill.normaliser.fitted):
             self.skill.load_state_dict(skill.state_dict())
+
+    def refuse_prior_alone(self, data: Any) -> None:
+        """Refuse batches of an `OnlineDataModule` in which the decoder finds nothing that was played here."""
+        if data.prior_rows == data.batch_size:
+            raise UserError(
+                f"model.follow is {self.lr}, but data.prior_share {data.hparams.prior_share} leaves no collected "
+                "transition in a batch for the decoder to learn from: give a smaller share"
+            )
 
     def groups(self, module: nn.Module) -> list[dict[str, Any]]:
         """What learns of a module that this one is part of, as groups of an optimiser: the decoder has its own rate."""

@@ -58,6 +58,11 @@ class CodeHead(nn.Module):
         log_pi = log_pi.masked_fill(~support, 0.0)  # 0 log 0 is 0
         return Expected((pi * critic(features)).sum(dim=-1), (pi * log_pi).sum(dim=-1))
 
+    @staticmethod
+    def entropy_unit(support: Tensor) -> Tensor:
+        """The most that the entropy can be, the log of how many codes of (K,) may be chosen: ()."""
+        return support.sum().double().log()
+
     def logits(self, features: Tensor, support: Tensor) -> Tensor:
         """Unnormalised log pi(k | s): (B, F) to (B, K)."""
         return self.net(features).masked_fill(~support, -torch.inf)
@@ -107,6 +112,10 @@ class BoxHead(nn.Module):
         log_normal = -0.5 * noise.square() - std.log() - 0.5 * math.log(2 * math.pi)
         log_slope = 2.0 * (math.log(2.0) - u - softplus(-2.0 * u))
         return u.tanh(), (log_normal - log_slope).sum(dim=-1)
+
+    def entropy_unit(self, support: Tensor) -> Tensor:
+        """What SAC adjusts the temperature for, -D: (); `support` is not used."""
+        return torch.tensor(-float(self.takes), device=support.device)
 
     def moments(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation before squashing, (B, D) each."""

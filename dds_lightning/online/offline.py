@@ -112,6 +112,7 @@ def start_offline(module: Any, path: str, states: Tensor | None = None) -> None:
     module.features.load_state_dict(policy.features.state_dict())
     module.actor.net.load_state_dict(policy.actor.state_dict())
     module.support_mask.copy_(policy.support_mask)
+    module.settle_entropy()
     for mine, other in ((module.critic, policy.critic), (module.target_critic, policy.target_critic)):
         given = other.state_dict()
         for name, value in mine.state_dict().items():

@@ -61,8 +61,8 @@ class SACModule(StageModule):
         backup_entropy: Whether the policy's entropy is part of the critics' target (the paper's SAC). Without it
             discrete SAC is stable (arXiv 2509.09838; RLPD and SUPE leave it out on AntMaze too).
         temperature: Alpha at the start (table 6: 0.1).
-        target_entropy: Entropy that alpha is adjusted for: a share of log K over codes, a share of -D over numbers;
-            null keeps alpha fixed.
+        target_entropy: Entropy that alpha is adjusted for: a share of log K over codes (K counts those with support),
+            a share of -D over numbers; null keeps alpha fixed.
         target_ema: Rate of the target network (table 6: 0.005).
         actor_start: Optimiser step from which the policy learns; before, only the critics do. For a policy from offline
             data, whose critics must see the environment first.
@@ -148,12 +148,12 @@ class SACModule(StageModule):
         self.novelty = Novelty(width + choices, hidden_dims) if prior_unknown else None
         self.follower = Follower(skill_settings, follow) if skill_settings else None
         self.log_alpha = nn.Parameter(torch.tensor(math.log(temperature)), requires_grad=target_entropy is not None)
-        aim = (target_entropy or 0.0) * (math.log(choices) if discrete else -choices)
-        self.register_buffer("target_entropy", torch.tensor(aim))
+        self.register_buffer("target_entropy", torch.zeros(()))
         self.value_range = torch.tensor([-torch.inf, torch.inf])  # what comes is not known: no value is impossible
         self.register_buffer("support_mask", torch.ones(self.num_skills, dtype=torch.bool))
         self._offline = one_start(offline, init_from)
         self._begin(init_from)
+        self.settle_entropy()
 
     # ---------------------------------------------------------------- choosing
 
@@ -235,6 +235,10 @@ class SACModule(StageModule):
         """The temperature of the policy's entropy."""
         return self.log_alpha.exp()
 
+    def settle_entropy(self) -> None:
+        """Let the setting decide the target entropy, whatever weights were loaded, and for the codes with support."""
+        self.target_entropy.copy_((self.hparams.target_entropy or 0.0) * self.actor.entropy_unit(self.support_mask))
+
     def _values(self, critic: nn.Module, inputs: Tensor) -> Tensor:
         """Inputs (B, F or F + D) to the values of every critic (N, B, K or 1)."""
         return critic(inputs.expand(self.hparams.critics, *inputs.shape))
@@ -302,11 +306,7 @@ class SACModule(StageModule):
         """Take the units and the skills to follow from the data, and policy and critics from offline training."""
         if self.follower is not None:
             data: Any = self.trainer.datamodule  # type: ignore[attr-defined]
-            if data.prior_rows == data.batch_size:
-                raise UserError(
-                    f"model.follow is {self.hparams.follow}, but data.prior_share {data.hparams.prior_share} leaves no "
-                    "collected transition in a batch for the decoder to learn from: give a smaller share"
-                )
+            self.follower.refuse_prior_alone(data)
             self.follower.start(data.skill)
         if not bool(self.normaliser.fitted):
             names = ["observation_mean", "observation_std"] + ([] if self.discrete else ["action_low", "action_high"])

@@ -12,6 +12,7 @@ from dds_lightning.errors import UserError
 from dds_lightning.online.offline import start_offline
 from dds_lightning.online.sac import SACModule
 from dds_lightning.policy import PolicyModule
+from dds_lightning.saving.checkpoint import STAGE_KEY
 
 B, WIDTH, K, D = 64, 4, 6, 3
 GAMMA = 0.97
@@ -178,6 +179,20 @@ def test_a_fixed_temperature_does_not_learn_and_a_late_policy_waits():
     module.learning = module.learning_at(10)
     total, _ = module.loss(batch)
     assert all(gradient is not None for gradient in gradients(total, module.actor.parameters()))
+
+
+def test_the_target_entropy_is_the_settings_whatever_weights_it_starts_from(tmp_path):
+    _, path = offline(tmp_path)
+    module = module_of("discrete", target_entropy=0.98)
+    assert module.target_entropy.item() == pytest.approx(0.98 * math.log(K))
+    start_offline(module, path)
+    assert module.target_entropy.item() == pytest.approx(0.98 * math.log(K - 1))  # log(K - 1) can be reached
+    saved = {"state_dict": module.state_dict(), "hyper_parameters": dict(module.hparams), STAGE_KEY: "online"}
+    torch.save(saved, tmp_path / "online.ckpt")
+    other = SACModule.starting_from(tmp_path / "online.ckpt", target_entropy=0.2)
+    assert other.target_entropy.item() == pytest.approx(0.2 * math.log(K - 1))
+    assert torch.equal(other.actor.net[0].weight, module.actor.net[0].weight)
+    assert module_of("raw", target_entropy=0.5).target_entropy.item() == -0.5 * D
 
 
 @pytest.mark.parametrize(
