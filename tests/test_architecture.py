@@ -63,8 +63,9 @@ ROOMS = {
     "datamodules.trajectories",
     "datamodules.transitions": "envs errors skill datamodules.loader datamodules.relabel datamodules.relabelling "
     "datamodules.segments",
-    "datamodules.online": "errors online skill tasks datamodules.loader datamodules.relabelled datamodules.relabelling "
-    "datamodules.robots datamodules.semi_mdp",
+    "datamodules.online_batches": "errors online",
+    "datamodules.online": "errors online skill tasks datamodules.loader datamodules.online_batches "
+    "datamodules.relabelled datamodules.relabelling datamodules.robots datamodules.semi_mdp",
     # training
     "dds_lightning.callbacks": "agent console envs errors module online policy rollout skill tasks",
     "dds_lightning.training": "callbacks configs console errors finetune module nn saving tasks",
