@@ -211,6 +211,7 @@ class _Planner:
                 "relabel", "dds_lightning.grid.work:relabel", own, dict(reads), self._title(cell, "relabel")
             )
         settings = {key: value for key, value in settings.items() if key not in row.added or value != row.added[key]}
+        settings |= {"revision": row.revision} if row.revision else {}
         settings |= {**self._task(cell), "seed": cell.seed, "stage": stage}
         return Node(stage, "dds_lightning.grid.work:train", settings, reads, self._title(cell, stage), how)
 

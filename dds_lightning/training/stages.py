@@ -41,6 +41,8 @@ class Stage:
         in_run: Whether `dds run` knows its settings; baselines are trained by `dds STAGE fit` and `dds study` alone.
         added: Settings that it has not had from the beginning, with the values that change nothing: a study goes on
             with what was trained without them.
+        revision: Raised where the same settings come to train or to act otherwise: a study does not take what was found
+            before for its own.
         commands: What its help lists beside `fit`, name to one line; None lists Lightning's others.
     """
 
@@ -58,6 +60,7 @@ class Stage:
     reads: Mapping[str, str] = field(default_factory=dict)
     in_run: bool = True
     added: Mapping[str, Any] = field(default_factory=dict)
+    revision: int = 0
     commands: Mapping[str, str] | None = None
 
     def module_class(self) -> type[StageModule]:
@@ -178,8 +181,18 @@ STAGES: dict[str, Stage] = {
             ("observation_dim", "action_dim", "horizon"),
             widths="data.horizon or model.hidden_dim",
         ),
-        _baseline("idql", "IDQL: an IQL critic chooses among actions of a diffusion model.", "idql:IDQL"),
-        _baseline("dql", "Diffusion-QL: a diffusion policy that climbs Q.", "diffusion_ql:DiffusionQL"),
+        _baseline(
+            "idql",
+            "IDQL: an IQL critic chooses among actions of a diffusion model.",
+            "idql:IDQL",
+            revision=1,  # noise of variance beta_t
+        ),
+        _baseline(
+            "dql",
+            "Diffusion-QL: a diffusion policy that climbs Q.",
+            "diffusion_ql:DiffusionQL",
+            added={**_NO_FOURIER, "model.temperature": 1.0},
+        ),
         _baseline(
             "dd",
             "Decision Diffuser: plans of states for a wanted return, and the actions between them.",
@@ -188,6 +201,7 @@ STAGES: dict[str, Stage] = {
             ("observation_dim", "action_dim", "horizon"),
             widths="data.horizon or model.hidden_dim",
             added={},
+            revision=1,  # returns in the range of those that plans start with
         ),
         _baseline("opal", "OPAL: IQL over continuous skills.", "opal:OPAL", "LatentDataModule", _LATENT, reads=_SKILL),
         _baseline(
@@ -197,6 +211,7 @@ STAGES: dict[str, Stage] = {
             "LatentDataModule",
             _LATENT,
             reads=_SKILL,
+            revision=1,  # noise of variance beta_t
         ),
     )
 }

@@ -1,11 +1,14 @@
 """Study files: what they span, and how a wrong one is answered."""
 
+from dataclasses import replace
+
 import pytest
 import yaml
 
 from dds_lightning.errors import UserError
 from dds_lightning.grid.file import find_study, packaged_studies, read_study
 from dds_lightning.grid.nodes import in_order, plan
+from dds_lightning.training.stages import STAGES
 
 TASK = "pointmaze-umaze-diverse"
 TINY = {"title": "Tiny", "tasks": [TASK]}
@@ -52,6 +55,15 @@ def test_a_setting_that_came_later_changes_no_key_until_it_does_something(tmp_pa
     more = study(tmp_path, methods=["clone"], settings={"clone.model.fourier_features": 8})
     seen = next(node for node in nodes(more).values() if node.kind == "clone")
     assert seen.settings["model.fourier_features"] == 8
+
+
+def test_a_method_that_came_to_train_otherwise_takes_no_earlier_result_for_its_own(tmp_path, monkeypatch):
+    asked = study(tmp_path, methods=["iql", "clone"])
+    before = nodes(asked)
+    monkeypatch.setitem(STAGES, "clone", replace(STAGES["clone"], revision=1))
+    after = nodes(asked)
+    assert [before[key].kind for key in before.keys() - after.keys() if before[key].kind != "evaluate"] == ["clone"]
+    assert len(before.keys() & after.keys()) == 3  # data, and the other method's two
 
 
 def test_a_task_has_settings_of_its_own_and_a_variant_still_departs_from_them(tmp_path):
