@@ -17,7 +17,7 @@ from torch import Tensor
 from torchmetrics import MeanMetric
 
 from dds_lightning.errors import UserError
-from dds_lightning.module import StageModule
+from dds_lightning.module import StageModule, planned_steps
 from dds_lightning.nn.bottleneck import Bottleneck, Skill
 from dds_lightning.nn.codebook import Codebook, CodebookInit
 from dds_lightning.nn.diffusion import DiffusionDecoder, MLPDecoder, Sampler
@@ -165,6 +165,7 @@ class SkillModule(StageModule):
         self.reconstruction_rmse = MeanMetric()
         self.usage = CodebookUsage(num_skills)
         self._settled = SettledCodes()
+        self._last_restart = float("inf")  # step of this training
         self._batch: Batch = {}  # of the step in progress: dead codes restart from it
         self._begin(init_from)
 
@@ -260,8 +261,10 @@ class SkillModule(StageModule):
         self.agree(self.bottleneck)
 
     def on_train_start(self) -> None:
-        """Freeze the codes again in a training that goes on."""
+        """Freeze the codes again in a training that goes on, and see until when codes may restart."""
         self._freeze_codes(self.global_step)
+        ends = (planned_steps(self.trainer), self.hparams.freeze_codes_after or -1)
+        self._last_restart = self.hparams.restart_until * min((end for end in ends if end > 0), default=float("inf"))
 
     def _freeze_codes(self, step: int) -> None:
         """Let the decoder alone learn from `freeze_codes_after` on."""
@@ -288,8 +291,7 @@ class SkillModule(StageModule):
         """Restart dead codes from this batch until the codebook has to settle, and freeze them in time."""
         h = self.hparams
         self._freeze_codes(step)
-        last = h.freeze_codes_after or self.trainer.max_steps
-        late = last > 0 and step > h.restart_until * last
+        late = step > self._last_restart
         if late or h.restart_threshold <= 0 or step % h.restart_every or "codebook" not in self.trained_parts:
             return
         generator = torch.Generator().manual_seed(step)
