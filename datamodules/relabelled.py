@@ -182,7 +182,7 @@ class RelabeledDataModule(pl.LightningDataModule):
         self.validation_index = held[torch.randperm(len(held), generator=torch.Generator().manual_seed(0))]
 
     def statistics(self) -> dict[str, Any]:
-        """What the policy needs of the data: normalisation, code shares, range of rewards, greatest discount."""
+        """What the policy needs of the data: normalisation, code shares, range of rewards, discount of values."""
         assert self.transitions is not None, "setup() comes first"
         t, i = self.transitions, self.train_index
         observations, rewards = t.observations[i], t.rewards[i]
@@ -192,7 +192,7 @@ class RelabeledDataModule(pl.LightningDataModule):
             "observation_std": observations.std(dim=0),
             "code_share": counts / counts.sum(),
             "reward_range": (rewards.min().item(), rewards.max().item()),
-            "max_discount": t.discounts[i].max().item(),
+            "max_discount": (t.discounts * (1.0 - t.dones))[i].max().item(),  # after an end no value follows
         }
 
     def state_dict(self) -> dict[str, Any]:

@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 import dds_lightning.losses as losses
-from dds_lightning.module import StageModule
+from dds_lightning.module import StageModule, planned_steps
 from dds_lightning.nn.draws import categorical
 from dds_lightning.nn.embedding import FOURIER
 from dds_lightning.nn.mlp import MLP
@@ -300,13 +300,21 @@ class PolicyModule(StageModule):
             observation_std: (O,).
             code_share: (K,) share of each code in the data.
             reward_range: Smallest and largest reward of a semi-MDP transition.
-            max_discount: Largest discount of a transition.
+            max_discount: Largest discount of a value that follows a transition.
         """
         self.normaliser.fit(observation_mean, observation_std)
         self.support_mask.copy_(code_share >= max(self.hparams.support, 1e-12))
         if max_discount < 1.0:
             low, high = (reward / (1.0 - max_discount) for reward in reward_range)
             self.value_range.copy_(torch.tensor([min(low, 0.0), max(high, 0.0)]))
+
+    def on_train_start(self) -> None:
+        """Warn where the training ends before the policy's turn comes."""
+        last = planned_steps(self.trainer)
+        if last > 0 and "actor" in self.trained_parts and "actor" not in self.learning_at(last - 1):
+            remedy = "lower it, raise trainer.max_steps, or give model.extraction=joint"
+            found = f"model.critic_steps is {self.hparams.critic_steps:,}, and the training ends at step {last:,}"
+            warnings.warn(f"{found}: the policy will have learnt nothing; {remedy}", stacklevel=1)
 
     def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> Tensor:
         """One optimiser step's loss."""

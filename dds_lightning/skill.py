@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from dds_lightning.errors import UserError
-from dds_lightning.module import StageModule
+from dds_lightning.module import StageModule, planned_steps
 from dds_lightning.nn.bottleneck import Bottleneck, Skill
 from dds_lightning.nn.codebook import Codebook, CodebookInit
 from dds_lightning.nn.decoder import Decoder
@@ -162,6 +162,7 @@ class SkillModule(StageModule):
         self.decoder = DECODERS[decoder].build(self.hparams)
         self.metrics = SegmentMetrics(num_skills if self.discrete else None)
         self._settled = SettledCodes()
+        self._last_restart = float("inf")  # step of this training
         self._batch: Batch = {}  # of the step in progress: dead codes restart from it
         self._begin(init_from)
 
@@ -258,8 +259,10 @@ class SkillModule(StageModule):
         self.agree(self.bottleneck)
 
     def on_train_start(self) -> None:
-        """Freeze the codes again in a training that goes on."""
+        """Freeze the codes again in a training that goes on, and see until when codes may restart."""
         self._freeze_codes(self.global_step)
+        ends = (planned_steps(self.trainer), self.hparams.freeze_codes_after or -1)
+        self._last_restart = self.hparams.restart_until * min((end for end in ends if end > 0), default=float("inf"))
 
     def _freeze_codes(self, step: int) -> None:
         """Let the decoder alone learn from `freeze_codes_after` on."""
@@ -286,10 +289,8 @@ class SkillModule(StageModule):
         """Restart dead codes until the codebook has to settle, and freeze the codes in time."""
         h = self.hparams
         self._freeze_codes(step)
-        last = h.freeze_codes_after or self.trainer.max_steps
-        late = last > 0 and step > h.restart_until * last
         due = h.restart_threshold > 0 and step % h.restart_every == 0
-        if due and not late and "codebook" in self.trained_parts:
+        if due and step <= self._last_restart and "codebook" in self.trained_parts:
             self._restart_dead_codes(step)
 
     def _restart_dead_codes(self, step: int) -> None:

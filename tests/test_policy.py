@@ -1,6 +1,7 @@
 """Discrete IQL and AWR: on a chain whose values are known, and on hand-made batches."""
 
 import math
+import warnings
 
 import lightning.pytorch as pl
 import pytest
@@ -251,6 +252,26 @@ def test_extraction_after_trains_the_critic_first_and_then_leaves_it_alone():
     assert not moved(states[20], states[40], "value")
     assert not moved(states[20], states[40], "critic")
     assert moved(states[20], states[40], "actor")
+
+
+@pytest.mark.parametrize(
+    ("settings", "warned"),
+    [
+        ({"extraction": "after", "critic_steps": 2}, True),
+        ({"extraction": "after", "critic_steps": 1}, False),
+        ({"extraction": "joint"}, False),
+        ({"extraction": "after", "trainable": "critic"}, False),
+    ],
+)
+def test_a_training_that_ends_before_the_policys_turn_is_warned_of(settings, warned):
+    module = small(observation_dim=5, **settings)
+    module.fit_statistics(torch.zeros(5), torch.ones(5), torch.ones(module.num_skills), (0.0, 1.0), 0.9)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        fit(module, 2, Chain())
+    told = [str(one.message) for one in caught if "the policy will have learnt nothing" in str(one.message)]
+    assert len(told) == warned
+    assert all("model.critic_steps is 2, and the training ends at step 2" in text for text in told)
 
 
 def test_target_critic_follows_at_the_polyak_rate():

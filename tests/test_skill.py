@@ -199,6 +199,24 @@ def test_a_restarted_code_forgets_its_moments():
     assert state["exp_avg"][2].abs().max() == 0.0
 
 
+@pytest.mark.parametrize(
+    ("ends", "settings", "last"),
+    [
+        ({"max_steps": 8}, {}, 4),
+        ({"max_steps": 100, "max_epochs": 2, "limit_train_batches": 4}, {}, 4),
+        ({"max_steps": -1, "max_epochs": 2, "limit_train_batches": 4}, {}, 4),
+        ({"max_steps": 8}, {"freeze_codes_after": 6}, 3),
+        ({"max_steps": 8}, {"freeze_codes_after": 100}, 4),
+    ],
+)
+def test_codes_restart_until_their_share_of_the_training_whatever_ends_it(ends, settings, last):
+    module = small(restart_every=1, restart_threshold=0.5, restart_until=0.5, codebook_init="uniform", **settings)
+    steps = []
+    module.bottleneck.revive = lambda *_: steps.append(module.global_step + 1) or {}
+    fit(module, **{"steps": 8, "limit_val_batches": 0, "val_check_interval": 1.0, **ends})
+    assert steps == list(range(1, last + 1))
+
+
 def test_a_continuous_model_has_no_codes():
     module = small(bottleneck="gaussian")
     data = segments(2)

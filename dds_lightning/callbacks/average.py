@@ -1,5 +1,7 @@
 """Averaged weights: much of what a decaying learning rate gives at the end of a training, at every moment of it."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import lightning.pytorch as pl
@@ -35,8 +37,10 @@ class AverageWeights(WeightAveraging):
         super().__init__(use_buffers=False)
 
     def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
-        """Copy the module when a fit begins."""
+        """Copy the module when a fit begins, to the device where the module is about to go."""
         super().setup(trainer, pl_module, stage)
+        if stage == "fit" and self._average_model is not None:
+            self._average_model.module.to(trainer.strategy.root_device)  # its counter stays: reading it would wait
         self._copied = None
 
     def on_train_batch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *args: Any, **kwargs: Any) -> None:
@@ -45,6 +49,10 @@ class AverageWeights(WeightAveraging):
         `AveragedModel.update_parameters` would collect all weights of both models again in every step, which takes
         longer than averaging them.
         """
+        self._update(trainer, pl_module)
+
+    def _update(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Follow the step that was just taken, once."""
         if trainer.global_step <= self._latest_update_step:
             return  # gradients are being accumulated
         self._latest_update_step = trainer.global_step
@@ -73,6 +81,17 @@ class AverageWeights(WeightAveraging):
         if self._average_model is not None:
             for theirs, ours in zip(self._average_model.module.buffers(), pl_module.buffers(), strict=True):
                 theirs.copy_(ours)
+
+    @contextmanager
+    def shown(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> Iterator[None]:
+        """Give the module the average between two training steps, the one that a checkpoint written now would hold."""
+        self._update(trainer, pl_module)
+        self._share_buffers(pl_module)
+        self._swap_models(pl_module)
+        try:
+            yield
+        finally:
+            self._swap_models(pl_module)
 
     def on_validation_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Validate the average."""

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import lightning.pytorch as pl
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 
 from dds_lightning.agent import AgentSelection, DDSAgent
+from dds_lightning.callbacks.average import AverageWeights
 from dds_lightning.callbacks.resume import undisturbed
 from dds_lightning.envs.pool import EnvPool
 from dds_lightning.errors import UserError, refuse_seed
@@ -140,7 +142,10 @@ class RolloutEvaluation(Callback):
         step = trainer.global_step
         if self.every_n_steps is None or step // self.every_n_steps == self._evaluated_step // self.every_n_steps:
             return
-        values = self._evaluate(trainer, pl_module)
+        averages = (one for one in trainer.callbacks if isinstance(one, AverageWeights))  # type: ignore[attr-defined]
+        average = next(averages, None)  # what plays is what a checkpoint of this step holds
+        with average.shown(trainer, pl_module) if average else nullcontext():
+            values = self._evaluate(trainer, pl_module)
         pl_module.log_dict(values, on_step=True, on_epoch=False, logger=False)
         for logger in trainer.loggers:  # here, as Lightning would log only every log_every_n_steps
             logger.log_metrics(values, step=step)

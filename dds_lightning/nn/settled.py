@@ -38,11 +38,12 @@ class SettledCodes(pl.Callback):
 
     def _known(self, starts: Tensor, encode: Callable[[], Tensor]) -> Tensor:
         """Look up codes (B,) by their segments' first rows in the data (B,), or compute them."""
+        self._codes = self._codes.to(starts.device)  # those of a checkpoint come on the CPU
         rows = int(starts.max()) + 1
         if rows > len(self._codes):
             more = max(rows, 2 * len(self._codes)) - len(self._codes)
             unknown = torch.full((more,), -1, dtype=torch.int16, device=starts.device)
-            self._codes = torch.cat([self._codes.to(starts.device), unknown])
+            self._codes = torch.cat([self._codes, unknown])
         codes = self._codes[starts].long()
         if bool((codes < 0).any()):
             codes = encode()

@@ -241,8 +241,8 @@ class StageCLI(LightningCLI):
     def _instantiate_trainer(self, config: dict[str, Any], callbacks: list[pl.Callback]) -> pl.Trainer:
         callbacks = [*callbacks, TrainingSettings(self._settings_to_keep())]
         trainer: pl.Trainer = super()._instantiate_trainer(trainer_settings(dict(config), callbacks), [])
-        h = self.model.hparams  # first the critic, then the actor; or first the prior, then the critic
-        alternates = h.get("extraction") == "after" or bool(h.get("prior_steps"))
+        h = self.model.hparams  # first the critic, then the actor; the prior, then the critic; all, then the decoder
+        alternates = h.get("extraction") == "after" or bool(h.get("prior_steps") or h.get("freeze_codes_after"))
         if alternates and isinstance(trainer.strategy, DDPStrategy):
             trainer.strategy._ddp_kwargs.setdefault("find_unused_parameters", True)
         return trainer

@@ -1,5 +1,7 @@
 """Averaged weights: the recursion, what a checkpoint holds, exact resuming, and what validation sees."""
 
+from types import SimpleNamespace
+
 import lightning.pytorch as pl
 import pytest
 import torch
@@ -88,6 +90,13 @@ def test_validation_sees_the_average_and_training_goes_on_with_its_own_weights(t
     assert all(torch.equal(one, two) for one, two in zip(watched.path, plain.path, strict=True))
     expected = averages(plain.path[1:])[3]  # after four steps
     torch.testing.assert_close(watched.validated[0], expected)
+
+
+def test_the_average_is_where_the_module_is_about_to_go():
+    """Its story: the module is still on the processor when a fit is set up, and the first step on a GPU failed."""
+    average, there = AverageWeights(DECAY), torch.device("meta")
+    average.setup(SimpleNamespace(strategy=SimpleNamespace(root_device=there)), Walk(), "fit")
+    assert {value.device for value in average._average_model.module.state_dict().values()} == {there}
 
 
 def test_without_a_decay_nothing_is_averaged(tmp_path):

@@ -10,6 +10,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger
 
 from datamodules.loader import TensorLoader
+from dds_lightning.callbacks.average import AverageWeights
 from dds_lightning.callbacks.resume import ExactResume
 from dds_lightning.callbacks.rollouts import RolloutEvaluation
 from dds_lightning.errors import UserError
@@ -124,6 +125,32 @@ def test_training_is_the_same_to_the_bit_with_and_without(tmp_path, module, data
         assert f"rollout/{name}" in trainer.callback_metrics
     assert 0 <= callback.history[0]["rollout/success"] <= 100
     assert callback.history[0]["rollout/length"] == 25
+
+
+def test_between_validations_the_average_plays_that_the_checkpoint_holds(tmp_path):
+    """Its story: the training's own weights played, and `best.ckpt` kept averages that nobody had seen play."""
+    played, held = [], []
+
+    class Plays(RolloutEvaluation):
+        def _play(self, trainer, pl_module):
+            played.append({name: value.clone() for name, value in pl_module.state_dict().items()})
+            return {"rollout/score": 0.0}
+
+    class Saves(pl.Callback):
+        def on_train_batch_end(self, trainer, pl_module, *_):
+            if trainer.global_step in (5, 10):
+                trainer.save_checkpoint(tmp_path / "now.ckpt")
+                held.append(torch.load(tmp_path / "now.ckpt", weights_only=True))
+
+    average = AverageWeights(0.9)
+    watched, _ = fit(tmp_path / "watched", [Plays(task=TASK.name, every_n_steps=5), average, Saves()])
+    plain, _ = fit(tmp_path / "plain", [AverageWeights(0.9)])
+    assert same(watched, plain)
+    assert len(played) == len(held) == 2
+    for seen, checkpoint in zip(played, held, strict=True):
+        assert all(torch.equal(value, checkpoint["state_dict"][name]) for name, value in seen.items())
+        own = checkpoint["current_model_state"]["decoder.net.output.weight"]
+        assert not torch.equal(seen["decoder.net.output.weight"], own)
 
 
 def test_the_skill_stage_tells_of_random_and_single_skills(tmp_path):

@@ -333,6 +333,15 @@ def test_statistics_are_those_of_the_training_transitions(trajectories, skill, t
     assert statistics["max_discount"] == pytest.approx(0.99)
 
 
+def test_a_segment_cut_short_by_an_end_does_not_widen_the_range_of_values(trajectories, skill, tmp_path):
+    """Its story: gamma^1 of a last step stood for gamma^H, and a critic could err tenfold unnoticed."""
+    data = module(trajectories, skill, tmp_path, discount="per_step")
+    data.prepare_data()
+    data.setup()
+    assert data.transitions.discounts.max().item() == pytest.approx(0.99)  # of a segment of one step, which ends there
+    assert data.statistics()["max_discount"] == pytest.approx(0.99**skill.horizon)
+
+
 # ---------------------------------------------------------------------- the settings in one record
 
 

@@ -91,3 +91,10 @@ def test_another_training_of_the_same_module_asks_for_codes_of_its_own():
     train(module)
     module.hparams.freeze_codes_after = 1  # from the first step on, with the codes that it has
     assert len(train(module, seed=1)) >= 13
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_the_codes_of_a_checkpoint_go_where_the_batches_are():
+    settled, starts = SettledCodes(), torch.tensor([0, 2], device="cuda")
+    settled.load_state_dict({"codes": torch.tensor([3, -1, 1], dtype=torch.int16)})
+    assert settled._known(starts, lambda: pytest.fail("both are known")).tolist() == [3, 1]

@@ -178,6 +178,7 @@ def dds(*words):
 def test_two_processes_train_and_report_once(strategy, tmp_path_factory):
     data = of_data(tmp_path_factory.mktemp("data"))
     words = [*data, *QUIET, *SKILL, "--trainer.max_steps=30", "--model.restart_every=10", "--checkpoint.dirpath=out"]
+    words += ["--model.freeze_codes_after=20"]  # the processes ended here: they waited for gradients that never came
     made = dds("skill", "fit", *words, *TWO, f"--trainer.strategy={strategy}", "--json")
     assert (made["steps"], made["checkpoint"]) == (30, "out/last.ckpt")
     assert {"train/loss", "val/loss", "val/codes_used"} <= set(made["metrics"])
