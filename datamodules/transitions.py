@@ -228,19 +228,19 @@ class SequenceDataModule(SegmentDataModule):
         Returns:
             Also ``reward_affine`` (2,), scale and shift of the learning rewards; ``return_range`` (2,), the least and
             the greatest return to go at the first step of an episode for training, and ``return_to_go_range`` (2,), at
-            any of its steps.
+            the first step of a segment for training.
         """
         found = super().statistics()
         _, returns = self._rewards
+        assert self._windows is not None
         first = returns[self.trajectories.step_offsets[self.training_episodes]]
-        episodes = self.trajectories.episode_of(np.arange(len(returns)))
-        every = returns[np.isin(episodes, self.training_episodes)]
+        starts = returns[self._windows.starts[self.training_segments]]
         affine = self.relabelling.for_task(self.task).affine(self.trajectories, 1)
         return {
             **found,
             "reward_affine": torch.tensor(affine),
             "return_range": torch.tensor([first.min(), first.max()]).float(),
-            "return_to_go_range": torch.tensor([every.min(), every.max()]).float(),
+            "return_to_go_range": torch.tensor([starts.min(), starts.max()]).float(),
         }
 
     def _loader(self, segments: NDArray[np.int64], **options: Any) -> TensorLoader:

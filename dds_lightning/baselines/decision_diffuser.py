@@ -10,7 +10,8 @@
 The present state is given and not diffused, as in the authors' code. Departures: a plan is diffused as its differences
 from the present state, each divided by its spread in the data, so that the next state, which alone decides the action,
 is as fine as the last; the temporal U-Net is our decoder's network over the whole plan; T and the noise follow our
-decoder's schedule, in place of 200 steps.
+decoder's schedule, in place of 200 steps; plans lie within an episode (theirs reach beyond its end, filled with zeros);
+and a termination costs nothing (theirs 100 on Hopper, of returns of 400).
 """
 
 from __future__ import annotations
@@ -58,7 +59,8 @@ class DecisionDiffuser(StageModule):
         diffusion_steps: T.
         untold: p, share of plans that learn without their return.
         guidance: w.
-        target: Return that is asked for, in the range of those of the data: 0 the least, 1 the greatest.
+        target: Return that is asked for, in the range of those that plans of the data start with: 0 the least, 1 the
+            greatest.
         noise_scale: Factor on the noise when planning (the authors' low temperature).
         lr: Adam's learning rate.
         lr_schedule: ``constant``, or ``cosine`` decay to zero at ``max_steps``.
@@ -136,7 +138,7 @@ class DecisionDiffuser(StageModule):
         return states[:, 1:] - states[:, :1]
 
     def scaled(self, returns: Tensor) -> Tensor:
-        """Returns to go in [0, 1], where 1 is the greatest of any step of the data."""
+        """Returns to go in [0, 1], where 1 is the greatest that a plan of the data starts with."""
         low, high = self.return_range
         return (returns - low) / (high - low).clamp_min(1e-6)
 

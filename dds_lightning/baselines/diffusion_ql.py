@@ -39,6 +39,8 @@ class DiffusionQL(CriticModule):
         backup_samples: Actions of the target policy in the target; with more than 1 the greatest target value counts
             (the authors take 10 on AntMaze).
         samples: Actions proposed when acting, one of which is drawn by the softmax of the target Q.
+        temperature: Divides Q in that softmax, so it depends on the unit of rewards: with ``reward_scale`` c instead of
+            the rewards as they are, c chooses as the authors do.
         hidden_dim: Width of the policy.
         blocks: Its residual blocks.
         dropout: Rate inside these.
@@ -71,6 +73,7 @@ class DiffusionQL(CriticModule):
         eta: float = 1.0,
         backup_samples: int = 1,
         samples: int = 50,
+        temperature: float = 1.0,
         hidden_dim: int = 256,
         blocks: int = 3,
         dropout: float = 0.0,
@@ -93,6 +96,7 @@ class DiffusionQL(CriticModule):
             ("eta", eta >= 0, "0 or more"),
             ("backup_samples", backup_samples >= 1, "at least 1"),
             ("samples", samples >= 1, "at least 1"),
+            ("temperature", temperature > 0, "positive"),
             ("target_ema", 0 < target_ema <= 1, "in (0, 1]"),
             ("actor_ema_every", actor_ema_every >= 1, "at least 1"),
         ]
@@ -135,7 +139,7 @@ class DiffusionQL(CriticModule):
         """Actions (B, A) for observations (B, O)."""
         x = self.embed(observations)
         proposed, q = proposals(self.actor, self.critic, x, self.hparams.samples, generator)
-        index = categorical(q.softmax(dim=-1), generator)
+        index = categorical((q / self.hparams.temperature).softmax(dim=-1), generator)
         return self.action_box.from_unit(take(proposed, index))
 
     def predict_step(self, batch: Batch, batch_idx: int) -> Tensor:

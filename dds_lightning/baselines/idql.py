@@ -8,6 +8,8 @@
 ```
 
 The authors' evaluation takes the best of the N samples (`selection: argmax`); the weights above are the paper's policy.
+Samples are drawn with noise of variance beta_t, as theirs; at each step the predicted action is kept in the box, in
+their code the noisy one. `lr_schedule` is that of all networks, in their code of the diffusion model alone.
 """
 
 from __future__ import annotations
@@ -107,7 +109,7 @@ class IDQL(CriticModule):
         self.value = MLP(width, 1, hidden_dims)
         self.critic = TwinCritic(width, action_dim, hidden_dims)
         shape = (width, action_dim, 0, hidden_dim, blocks, dropout, diffusion_steps)
-        self.actor, self.target_actor = with_target(lambda: DiffusionDecoder(*shape))
+        self.actor, self.target_actor = with_target(lambda: DiffusionDecoder(*shape, variance="beta"))
         self._begin(init_from)
 
     def loss(self, batch: Batch) -> Loss:

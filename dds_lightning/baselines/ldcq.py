@@ -11,7 +11,8 @@ The network predicts noise, and ``|| z - z_hat ||^2 = || eps - eps_hat ||^2 / SN
 Departures: z is the mean of q, T follows our decoder's schedule, and the data are drawn evenly, without priorities.
 The authors' code takes the skill that is best for one target critic, and there the smaller of both values; here the
 smaller of both is taken for every skill, and then the best. Their encoder keeps close to a prior that depends on the
-state, ours to N(0, I).
+state, ours to N(0, I); they take skills as they are, here each dimension is divided by its spread. They discount by
+gamma^H on locomotion (`data.discount: per_step`), and by gamma a skill, 0.995, in mazes and the kitchen (`per_skill`).
 """
 
 from __future__ import annotations
@@ -97,7 +98,7 @@ class LDCQ(LatentModule):
         self._refuse(rules)
         width, self.skills = self._make_embedding(self.hparams), Normaliser(skill_dim)
         shape = (width, skill_dim, 0, hidden_dim, blocks, 0.0, diffusion_steps)
-        self.prior = DiffusionDecoder(*shape, clip=False)  # skills lie in no box
+        self.prior = DiffusionDecoder(*shape, clip=False, variance="beta")  # skills lie in no box
         self.critic = TwinCritic(width, skill_dim, hidden_dims)
         self._begin(init_from)
 

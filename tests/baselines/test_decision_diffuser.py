@@ -102,11 +102,13 @@ def test_it_plans_for_the_mode_that_pays():
     assert ahead[:, 1].abs().max() < 0.05  # and who pays stays
 
 
-def test_a_return_of_one_is_the_greatest_of_any_step_and_not_of_the_first_ones_alone():
-    data = two_modes(20)
+def test_a_return_of_one_is_the_greatest_that_a_plan_starts_with():
+    data = two_modes(20)  # episodes of 8 steps
     data.rewards[:] = 0.0
-    data.rewards[data.step_offsets[:-1] + 4] = -3.0  # behind it more is to be earned than at the start
-    module = SequenceDataModule.from_trajectories(data, horizon=4, gamma=1.0)
+    data.rewards[data.step_offsets[1:] - 1] = 128.0
+    module = SequenceDataModule.from_trajectories(data, horizon=4, gamma=0.5)
     found = module.statistics()
-    assert found["return_range"].tolist() == [-3.0, -3.0]
-    assert found["return_to_go_range"].tolist() == [-3.0, 0.0]
+    assert found["return_range"].tolist() == [1.0, 1.0]  # 128 / 2^7 at the start of an episode
+    assert found["return_to_go_range"].tolist() == [1.0, 16.0]  # the last plan starts 3 steps before the end
+    firsts = torch.cat([batch["returns"][:, 0] for batch in module.train_dataloader()])
+    assert firsts.max() == 16.0  # a target of 1 is one that the network has seen

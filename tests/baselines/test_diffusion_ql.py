@@ -51,6 +51,23 @@ def test_the_target_policy_waits_and_moves_every_fifth_step():
     assert [len(module.followers(step)) for step in (5, 10, 11, 15)] == [1, 2, 1, 2]
 
 
+def test_the_choice_among_proposals_does_not_depend_on_the_unit_of_rewards(monkeypatch):
+    torch.manual_seed(0)
+    module, x = DiffusionQL(3, 2, [8, 8], hidden_dim=8, blocks=1), torch.randn(64, 3)
+    q = torch.tensor([0.0, 2.0, 4.0]).expand(64, 3)
+    actions = torch.tensor([-1.0, 0.0, 1.0])[None, :, None].expand(64, 3, 2)
+
+    def chosen(scale: float, temperature: float) -> torch.Tensor:
+        monkeypatch.setattr("dds_lightning.baselines.diffusion_ql.proposals", lambda *_: (actions, scale * q))
+        module.hparams.temperature = temperature
+        return module.act(x, torch.Generator().manual_seed(0))
+
+    as_recorded = chosen(1.0, 1.0)
+    assert torch.equal(as_recorded, chosen(0.01, 0.01))
+    assert (as_recorded == 1.0).float().mean() > 0.75  # e^4 / (1 + e^2 + e^4) is 0.87
+    assert (chosen(0.01, 1.0) == 1.0).float().mean() < 0.5  # 0.34: hardly a choice any more
+
+
 def test_it_finds_the_mode_that_pays():
     torch.manual_seed(0)
     data = TransitionDataModule.from_trajectories(two_modes(), batch_size=128, gamma=0.9, reward_scale="auto")

@@ -49,6 +49,19 @@ def test_the_averages_follow_at_their_rates():
     assert torch.allclose(next(module.target_actor.parameters()) - before[1], torch.tensor(0.25), atol=1e-6)
 
 
+def test_actions_are_drawn_with_the_noise_of_the_authors_sampler():
+    """Of N(0, 0.05) a perfect network leaves 0.138 of the standard deviation of 0.224; with less noise 0.087."""
+    for actor in (IDQL(3, 1, hidden_dim=8, blocks=1).actor, IDQL(3, 1, hidden_dim=8, blocks=1).target_actor):
+
+        def noise(noisy, t, *_, actor=actor):
+            kept = actor.alpha_bars[t, None]
+            return (1 - kept).sqrt() * noisy / (1 - 0.95 * kept)
+
+        actor.predict_noise = noise
+        drawn = actor.sample(torch.zeros(20_000, 3), torch.zeros(20_000, 0), generator=torch.Generator().manual_seed(0))
+        assert abs(drawn.std().item() - 0.138) < 0.01
+
+
 def test_it_finds_the_mode_that_pays():
     torch.manual_seed(0)
     data = TransitionDataModule.from_trajectories(two_modes(), batch_size=128, gamma=0.9, reward_scale="auto")

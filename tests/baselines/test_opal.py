@@ -82,6 +82,13 @@ def test_ldcqs_losses_are_the_authors_formulas():
     assert total.item() == pytest.approx(q_loss.item(), abs=1e-5)
 
 
+def test_ldcqs_proposals_are_spread_as_the_data():
+    prior = LDCQ(3, 1, hidden_dims=[8], hidden_dim=8, blocks=1, diffusion_steps=5).prior
+    prior.predict_noise = lambda noisy, t, *_: (1 - prior.alpha_bars[t, None]).sqrt() * noisy  # exact for N(0, 1)
+    drawn = prior.sample(torch.zeros(20_000, 3), torch.zeros(20_000, 0), generator=torch.Generator().manual_seed(0))
+    assert drawn.std().item() == pytest.approx(0.897, abs=0.01)  # 0.675 with the posterior's variance
+
+
 def test_the_actions_of_the_data_are_the_encoders_means(skills):
     data = data_of(skills)
     batch = next(iter(data.train_dataloader()))

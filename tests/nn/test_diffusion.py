@@ -80,6 +80,19 @@ def test_five_steps_blur_what_fifty_steps_resolve(trained, sampler):
     assert shares(exact_decoder(50), state, skill, sampler)[1] > 0.98
 
 
+def standard_normal_draws(decoder: DiffusionDecoder) -> torch.Tensor:
+    """20,000 draws with the denoiser that knows that x0 is N(0, 1): E[epsilon | x_t] is sqrt(1 - alpha_bar) x_t."""
+    decoder.predict_noise = lambda noisy, t, *_: (1 - decoder.alpha_bars[t, None]).sqrt() * noisy
+    nothing = torch.zeros(20_000, 0)
+    return decoder.sample(nothing, nothing, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize(("variance", "spread"), [("posterior", 0.675), ("beta", 0.897)])
+def test_five_steps_with_a_perfect_network_keep_this_much_of_a_normal_distribution(variance, spread):
+    decoder = DiffusionDecoder(0, 1, 0, hidden_dim=8, blocks=1, clip=False, variance=variance)
+    assert standard_normal_draws(decoder).std().item() == pytest.approx(spread, abs=0.01)
+
+
 def test_a_regressor_answers_between_the_modes():
     torch.manual_seed(0)
     decoder = MLPDecoder(1, 1, 2, hidden_dim=16, blocks=1, dropout=0.0)
