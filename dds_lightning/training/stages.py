@@ -201,7 +201,6 @@ STAGES: dict[str, Stage] = {
             ("observation_dim", "action_dim", "horizon"),
             widths="data.horizon or model.hidden_dim",
             added={},
-            revision=1,  # returns in the range of those that plans start with
         ),
         _baseline("opal", "OPAL: IQL over continuous skills.", "opal:OPAL", "LatentDataModule", _LATENT, reads=_SKILL),
         _baseline(
