@@ -25,6 +25,10 @@ STD_FLOOR = MIN_STD
 zero."""
 
 
+MORE_HELD_OUT = 0.2
+"""Share of the steps that may be held out beyond what was asked for without a warning."""
+
+
 class SegmentDataModule(pl.LightningDataModule):
     """Sliding windows over offline episodes, as batches `{"observations": (B, H, O), "actions": (B, H, A)}`.
 
@@ -141,6 +145,7 @@ class SegmentDataModule(pl.LightningDataModule):
         data = self._loaded()
         self._windows = data.windows(self.horizon, self.stride, self.tail)
         self.training_episodes, self.validation_episodes = data.split(self.validation_fraction, self.seed, self.horizon)
+        self._warn_of_lost_data(data)
         held_out = np.isin(self._windows.episodes, self.validation_episodes)
         self.training_segments = np.flatnonzero(~held_out)
         self.validation_segments = np.flatnonzero(held_out)
@@ -150,6 +155,17 @@ class SegmentDataModule(pl.LightningDataModule):
         # In a random order, so that the first batches, all that a training may look at, are a fair sample: in many a
         # file the episodes of one controller come before those of another.
         np.random.default_rng(0).shuffle(self.validation_segments)
+
+    def _warn_of_lost_data(self, data: Trajectories) -> None:
+        """Warn where whole episodes are so long that far more than `validation_fraction` is not learnt from."""
+        share = data.lengths[self.validation_episodes].sum() / data.num_steps
+        if share > self.validation_fraction + MORE_HELD_OUT:
+            warnings.warn(
+                f"data.validation_fraction is {self.validation_fraction:g}, but whole episodes are held out, and with "
+                f"{data.num_episodes} of them that is {share:.0%} of the steps: record more episodes, cut long ones, "
+                "or give 0 and do without held-out loss",
+                stacklevel=3,
+            )
 
     def train_dataloader(self) -> TensorLoader:
         """Shuffled, full batches, shared among processes."""

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -311,3 +312,12 @@ def test_lightning_resumes_at_the_very_batch(data: Trajectories, tmp_path: Path,
     second, _ = _fit(data, tmp_path, 15, tmp_path / "at.ckpt", limit_train_batches=limit)
     assert len(whole.heard) == 15
     assert first.heard + second.heard == whole.heard
+
+
+def test_it_warns_where_whole_episodes_hold_out_far_more_than_was_asked_for(make_episode: Make) -> None:
+    few, many = (Trajectories.from_episodes("d", [make_episode(30) for _ in range(count)]) for count in (2, 10))
+    with pytest.warns(UserWarning, match=r"validation_fraction is 0\.05, .* with 2 of them that is 50% of the steps"):
+        SegmentDataModule.from_trajectories(few, horizon=5).setup()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        SegmentDataModule.from_trajectories(many, horizon=5).setup()
