@@ -85,8 +85,8 @@ ROOMS = {
     "dds_lightning.pipeline": "agent baselines configs console envs errors interpret.draw online policy rollout saving "
     "skill study tasks training datamodules.collect datamodules.inspection datamodules.relabelled "
     "datamodules.relabelling datamodules.semi_mdp datamodules.sources",
-    "dds_lightning.grid": "agent baselines configs console envs errors online rollout saving study tasks training "
-    "datamodules.collect datamodules.relabelled datamodules.relabelling datamodules.sources",
+    "dds_lightning.grid": "agent baselines configs console envs errors online rollout saving skill study tasks "
+    "training datamodules.collect datamodules.relabelled datamodules.relabelling datamodules.sources",
     "dds_lightning.cli": "_version agent baselines configs console errors grid interpret.draw online pipeline policy "
     "rollout saving sharing skill study tasks training datamodules.collect datamodules.inspection datamodules.listing "
     "datamodules.physics datamodules.relabelled datamodules.relabelling datamodules.semi_mdp datamodules.sources",

@@ -220,7 +220,7 @@ def _refuse_model(stage: str, rooms: Mapping[str, Mapping[str, Any]], task: str,
     links = {"observation_dim": known.observation_dim, "action_dim": known.action_dim, "horizon": data.get("horizon")}
     links |= {"num_skills": skills.get("num_skills"), "skill_dim": skills.get("skill_dim"), "skill_hash": None}
     if "space" in row.links:
-        raw, discrete = data["actions"] == "raw", skills.get("bottleneck") == "vq"
+        raw, discrete = data["actions"] == "raw", has_codes(skill)
         links["space"] = "raw" if raw else "discrete" if discrete else "continuous"
         links["choices"] = known.action_dim if raw else links["num_skills" if discrete else "skill_dim"]
         links["prior_unknown"] = data["prior_rewards"] == "unknown"
@@ -229,6 +229,13 @@ def _refuse_model(stage: str, rooms: Mapping[str, Mapping[str, Any]], task: str,
     if model.get("init_from") is None:
         with torch.device("meta"):
             row.module_class()(**{name: links[name] for name in row.links}, **model)
+
+
+def has_codes(skill: Mapping[str, Any]) -> bool:
+    """Whether skills of these settings have codes; without settings there are no skills."""
+    from dds_lightning.skill import BOTTLENECKS
+
+    return bool(skill) and BOTTLENECKS[skill["model.bottleneck"]].discrete
 
 
 def _is_number(value: Any) -> bool:

@@ -20,7 +20,7 @@ from datamodules.relabelling import Relabelling
 from dds_lightning.configs import run_defaults
 from dds_lightning.errors import UserError
 from dds_lightning.grid.cells import BUDGETS, OURS, PLAYERS, Cell, Study, argument
-from dds_lightning.grid.checks import check_stage
+from dds_lightning.grid.checks import check_stage, has_codes
 from dds_lightning.saving.untrusted import read_yaml
 from dds_lightning.tasks import facts_to_keep, get_task, is_own
 from dds_lightning.training.options import GENERAL, options
@@ -137,12 +137,10 @@ class _Planner:
         Raises:
             UserError: The agent has no skills, or no codes, or its skills do not last so long.
         """
-        of_skills = sorted(asked.keys() - {"episodes"})
+        of_skills, title = sorted(asked.keys() - {"episodes"}), PLAYERS[cell.method].title
         if of_skills and "skill" not in made:
-            title = PLAYERS[cell.method].title
             raise UserError(f"evaluate.{of_skills[0]} is for agents over skills, and {title} has none: leave it out")
-        if asked.get("selection") == "argmax_q" and made["skill"].settings["model.bottleneck"] != "vq":
-            title = PLAYERS[cell.method].title
+        if asked.get("selection") == "argmax_q" and not has_codes(made["skill"].settings):
             raise UserError(
                 f"evaluate.selection is argmax_q, which needs codes, and the skills of {title} are continuous"
             )
